@@ -54,6 +54,7 @@ TABLES = {
     "real-scans": "hand_eye_sigmas:REAL_SCANS",
     "results": "results:TABLE",
     "scanner-laws": "foreign_laws:SCANNER",
+    "stock": "stock:TABLE",
     "turning": "real_arms:TURNING",
     "unknown-laws": "unknown_laws:TABLE",
     "watch": "watch:TABLE",

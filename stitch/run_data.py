@@ -21,7 +21,11 @@ from stitch.session.session import SessionData
 from stitch.system.values import Table, Value
 
 # By which methods register moves single views, for people.
-METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
+METHOD_TITLES = {
+    "dpwvm": "DPWVM-style weighted fit",
+    "gicp": "plane to plane (GICP) inside Tukey's biweight",
+    "vmm": "variance minimisation in two classes (VMM)",
+}
 # Chance that a given hand-eye which is right is doubted.
 _DOUBTED = 0.01
 # A hand-eye that is off by so many of its U would be found: else these views do not say whether it is right.
@@ -45,7 +49,7 @@ class StageResult(Value):
     iterations: int
     seconds: float = field(compare=False)
     note: str = ""  # one plain sentence for people
-    method: str = ""  # of register, between surfaces: dpwvm | gicp
+    method: str = ""  # of register, between surfaces: dpwvm | gicp | vmm
 
     @property
     def remark(self) -> str:

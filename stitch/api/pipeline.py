@@ -64,7 +64,7 @@ def run(
         effects: names of effects to fit together with the hand-eye.
         arm: effects of joints and links that stay as they are, while everything else is fitted.
         keep: fuse also the views that do not belong.
-        register: method by which single views are registered, `dpwvm` or `gicp`; labelled points need none.
+        register: method by which single views are registered, `dpwvm`, `gicp` or `vmm`; labelled points need none.
 
     Raises:
         InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.

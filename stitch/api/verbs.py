@@ -31,7 +31,7 @@ from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
 
-Register = Literal["dpwvm", "gicp"]
+Register = Literal["dpwvm", "gicp", "vmm"]
 
 
 def run(
@@ -52,7 +52,7 @@ def run(
         effects: names of effects to fit together with the hand-eye.
         keep: fuse also the views that do not belong.
         arm: a run, or a model, of whose joints and links the effects stay as they are, while all else is fitted.
-        register: method by which single views are registered, "dpwvm" or "gicp"; labelled points need none.
+        register: method by which single views are registered, "dpwvm", "gicp" or "vmm"; labelled points need none.
         progress: is called with a line a stage, as the logger `stitch` is.
 
     Returns:

@@ -54,7 +54,7 @@ _Effects = Annotated[str, typer.Option("--effects", help="Effects to fit, separa
 _Keep = Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")]
 _Register = Annotated[
     str | None,
-    typer.Option("--register", metavar="METHOD", help="How single views are registered: dpwvm (usual) or gicp."),
+    typer.Option("--register", metavar="METHOD", help="How single views are registered: dpwvm (usual), gicp or vmm."),
 ]
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
 _Mesh = Annotated[

@@ -61,7 +61,7 @@ class Pipeline(Protocol):
         Args:
             coarse: the stage before the fit.
             seconds: that the fit has taken.
-            method: by which surfaces are registered: dpwvm or gicp.
+            method: by which surfaces are registered: dpwvm, gicp or vmm.
             until_screened: returns when it is known that all views stay.
         """
         ...

@@ -12,17 +12,21 @@ is built here follows its published relatives and says of each part what is sour
   same weight and exchange their places with the views; the cleaner class gives both their scale.
 - *Weights*, `dpwvm_weights`: distance, sign class, density and incidence, found anew at every iteration.
 
-The other method, `plane_weights`, is plane to plane (GICP) inside Tukey's biweight: of the families compared in
-docs/register.md the best. Both factors are 1 where two views agree, and neither depends on the order of the views.
+Two methods stand beside it. `vmm_weights` is the family as it is published: a class has its own mean, its distances
+weigh by how near they lie to it, and the sum of both variances is made small (`class_variances`). Nothing but the
+robot's poses holds an offset of a view then. `plane_weights` is plane to plane (GICP) inside Tukey's biweight: of the
+families compared in docs/register.md the best. Both of its factors are 1 where two views agree, and neither depends on
+the order of the views.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.distributions import MAD_TO_SIGMA, mad_sigma, tukey
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import Gram, robust_scale
 from stitch.session.capture import Capture
@@ -39,6 +43,7 @@ _SPARSE = 2.0
 # single distances. Stock of 0.3 mm on simulated blades showed 9 to 14 times the scatter; a scanner's own errors showed
 # up to 4 on a shiny cone, and 0.6 in cells with a biased scanner.
 _SURE, _LARGE = 25.0, 6.0
+_ROUNDING = 1e-12
 
 
 def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
@@ -57,6 +62,47 @@ def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> l
     off = [m.residual - mu for m, mu in zip(matches, middle, strict=True)]
     scale = mad_sigma(np.concatenate(off))
     return [b * tukey(e, class_scale(e, scale)) for b, e in zip(base, off, strict=True)]
+
+
+def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
+    """Return weights (M,) per match of two classes, d ≥ 0 and d < 0: w = exp(−(d − μ±)²/2σ±²) · incidence · density.
+
+    As published for allowances: μ± is the weighted mean of a class and σ± its robust sigma. Perfect agreement counts
+    less than half then, since the mean of a half-normal lies at 0.8 σ.
+    """
+    weights = []
+    for m in matches:
+        w = incidence(m, capture, poses) * density(m, capture)
+        for side in _sides(m):
+            off = m.residual[side] - w[side] @ m.residual[side] / w[side].sum()
+            w[side] *= np.exp(-0.5 * (off / max(mad_sigma(off), _ROUNDING)) ** 2)
+        weights.append(w)
+    return weights
+
+
+def class_variances(g: Gram, matches: Sequence[Match], weights: Sequence[Array]) -> Gram:
+    """Return the sums of Var₊ + Var₋ of every pair in place of its squares: rows and distances less their class's mean.
+
+    Both classes count alike, and together as much as the pair's weight.
+    """
+    matrix, vector, square = np.zeros_like(g.matrix), np.zeros_like(g.vector), np.zeros_like(g.square)
+    for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
+        rows = frames.plane_rows(m.middle - g.centre, m.normal)
+        sides = _sides(m)
+        for side in sides:
+            of_class = w[side] * w.sum() / (len(sides) * w[side].sum())
+            B = rows[side] - w[side] @ rows[side] / w[side].sum()
+            e = m.residual[side] - w[side] @ m.residual[side] / w[side].sum()
+            matrix[i] += (B * of_class[:, None]).T @ B
+            vector[i] += (B * of_class[:, None]).T @ e
+            square[i] += of_class @ e**2
+    return replace(g, matrix=matrix, vector=vector, square=square)
+
+
+def _sides(m: Match) -> list[Indices]:
+    """Return the distances of the plus and of the minus class, where there are any."""
+    sides = (np.flatnonzero(m.residual >= 0), np.flatnonzero(m.residual < 0))
+    return [side for side in sides if len(side)]
 
 
 def incidence(m: Match, capture: Capture, poses: Array) -> Array:
@@ -96,30 +142,43 @@ def class_scale(e: Array, scale: float) -> float:
 class OffsetSums:
     """Sums over the correspondences by which offsets of the views' surfaces enter the normal equations.
 
-    The surface of view v stands off by a_v along its normals, so that a pair sees e + B(δ_v − δ_w) − (a_v − a_w).
+    The surface of view v stands off by a_v along its normals, so that a pair sees e + B(δ_v − δ_w) − (a_v − a_w). Of a
+    scan that had stock on a part of it, a acts there alone.
     """
 
-    def __init__(self, g: Gram, matches: Sequence[Match], weights: Sequence[Array]) -> None:
+    def __init__(self, g: Gram, matches: Sequence[Match], weights: Sequence[Array], capture: Capture) -> None:
         views = g.views
         self.coupling = np.zeros((views, 6, views))  # Σ ±w Bᵀ, twists against offsets, less their sign
         self.matrix = np.zeros((views, views))  # Σ ±w
         self.vector = np.zeros(views)  # Σ ±w e
         self.square = np.zeros(len(matches))  # (P,) Σ w (e − ē)²: a pair's weighted variance, times its weight
+        self.known = [v for v, scan in enumerate(capture.scans) if scan.stock is not None]
         for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
             weight, first = float(w.sum()), float(w @ m.residual)
-            row = w @ frames.plane_rows(m.middle - g.centre, m.normal)
-            for a, b, sign in ((m.v, m.v, 1), (m.w, m.w, 1), (m.v, m.w, -1), (m.w, m.v, -1)):
-                self.coupling[a, :, b] += sign * row
-                self.matrix[a, b] += sign * weight
-            self.vector[m.v] += first
-            self.vector[m.w] -= first
+            rows = frames.plane_rows(m.middle - g.centre, m.normal)
+            acts = {m.v: _acts(capture, m.v, m.index_v), m.w: -_acts(capture, m.w, m.index_w)}
+            for b, of_b in acts.items():
+                pull = (w * of_b) @ rows
+                self.vector[b] += (w * of_b) @ m.residual
+                self.coupling[m.v, :, b] += pull
+                self.coupling[m.w, :, b] -= pull
+                for a, of_a in acts.items():
+                    self.matrix[a, b] += w @ (of_a * of_b)
             self.square[i] = float(w @ m.residual**2) - first**2 / max(weight, 1e-300)
+
+
+def _acts(capture: Capture, view: int, index: Indices) -> Array:
+    """Return (M,) 1 for points of a view on which its offset acts, 0 for others."""
+    stock = capture.scans[view].stock
+    return np.ones(len(index)) if stock is None else stock.points[index].astype(float)
 
 
 def with_offsets(
     H: Array, b: Array, sums: OffsetSums, variance: float, scale: float
 ) -> tuple[Array, Array, dict[int, float]]:
     """Return normal equations (6V, 6V) and (6V,) in which the offsets that views show cost nothing, and these offsets.
+
+    Those of views of which it is known cost nothing either, and are not among them.
 
     An offset that is eliminated (Schur complement) leaves the weighted variance of that view's distances, λ = 0; the
     rest keep λ = 1. They are the same equations if no view shows one.
@@ -130,11 +189,13 @@ def with_offsets(
         scale: robust sigma of the distances.
     """
     C, D, e = sums.coupling.reshape(len(H), -1) / variance, sums.matrix / variance, sums.vector / variance
-    free = shared_offsets(D - C.T @ np.linalg.solve(H, C), e - C.T @ np.linalg.solve(H, b), _LARGE * scale)
+    information = D - C.T @ np.linalg.solve(H, C)
+    free = shared_offsets(information, e - C.T @ np.linalg.solve(H, b), _LARGE * scale, sums.known)
     if not free:
         return H, b, {}
     H, b, sizes = eliminate(H, b, C[:, free], D[np.ix_(free, free)], e[free])
-    return H, b, dict(zip(free, map(float, sizes), strict=True))
+    found = zip(free, map(float, sizes), strict=True)
+    return H, b, {v: size for v, size in found if v not in sums.known}
 
 
 def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array) -> tuple[Array, Array, Array]:
@@ -143,7 +204,7 @@ def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array)
     return H - coupling @ solved[:, :-1], b - coupling @ solved[:, -1], np.asarray(solved[:, -1], float)
 
 
-def shared_offsets(information: Array, vector: Array, least: float) -> list[int]:
+def shared_offsets(information: Array, vector: Array, least: float, known: Sequence[int] = ()) -> list[int]:
     """Return the views whose surface stands off as a whole, the surest first; never all of them.
 
     One after the other the view with the largest χ² = c²/A of its offset, those before it set free, until χ² < 25 or
@@ -153,6 +214,7 @@ def shared_offsets(information: Array, vector: Array, least: float) -> list[int]
         information: A (V, V) of the offsets, the twists eliminated.
         vector: c (V,) gradient at no offset.
         least: size below which an offset is left to the poses.
+        known: views that are known to have stood off: they are free whatever is left of it.
     """
     free: list[int] = []
     A, c = information.copy(), vector.copy()
@@ -161,6 +223,9 @@ def shared_offsets(information: Array, vector: Array, least: float) -> list[int]
         size = np.maximum(np.diag(A), blind)
         chi2 = np.where(np.isin(np.arange(len(A)), free), 0.0, c**2 / size)
         shown = (chi2 > _SURE) & (np.abs(c) > least * size)
+        due = [v for v in known if v not in free and A[v, v] > blind]
+        shown[due] = True
+        chi2[due] = np.inf
         if not shown.any():
             break
         best = int(np.argmax(np.where(shown, chi2, 0.0)))

@@ -350,6 +350,10 @@ class _ViewInSlabs:
         low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
         near = np.flatnonzero((height >= low - self.margin) & (height < high + self.margin))
         points = self._corrected(cloud, near) if self.moves else cloud.points[near]
+        if self.scan.stock is not None:
+            nearest = self.scan.tree.query(points)[1]
+            off = self.scan.stock.thickness * self.scan.stock.points[nearest]
+            points = points - off[:, None] * self.scan.normals[nearest]
         columns = [_along(self.T, points, i) for i in range(3)]
         # Numbers of 16 bits are sorted in a fifth of the time.
         slab = self.slabs.of(columns[self.slabs.axis]).astype(np.int16)

@@ -1,7 +1,8 @@
 """Register what the hand-eye cannot explain: all views at once, each held by the robot's pose.
 
-Two methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm_weights`),
-and `gicp`, plane to plane inside Tukey's biweight (`plane_weights`). The cost is the weighted mean of Var(d) +
+Three methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm_weights`),
+`vmm`, that of a plus and a minus class about their own means (`vmm_weights`), and `gicp`, plane to plane inside Tukey's
+biweight (`plane_weights`). The cost is the weighted mean of Var(d) +
 λ·mean(d)² with λ = 1: an offset common to all points of a pair is the very step that stitching has to close. Under
 `dpwvm` λ is 0 for a view that shows an offset of its own, as stock on a casting.
 
@@ -16,7 +17,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stitch.errors import InputError, did_you_mean
-from stitch.fusion.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
+from stitch.fusion.correspondence_weights import (
+    OffsetSums,
+    class_variances,
+    dpwvm_weights,
+    plane_weights,
+    vmm_weights,
+    with_offsets,
+)
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
@@ -53,11 +61,13 @@ class Method:
     name: str
     weigh: CorrespondenceWeights
     offsets: bool = False
+    classes: bool = False  # what is made small are the variances of the distances' plus and minus class
 
 
 DPWVM = Method("dpwvm", dpwvm_weights, offsets=True)
 GICP = Method("gicp", plane_weights)
-METHODS = {method.name: method for method in (DPWVM, GICP)}
+VMM = Method("vmm", vmm_weights, classes=True)
+METHODS = {method.name: method for method in (DPWVM, GICP, VMM)}
 DEFAULT = DPWVM.name
 
 
@@ -69,7 +79,7 @@ def method_named(name: str) -> Method:
     """
     if name not in METHODS:
         raise InputError(
-            f"register {name}: no method has this name{did_you_mean(name, METHODS)}; to fix: {' or '.join(METHODS)}"
+            f"register {name}: no method has this name{did_you_mean(name, METHODS)}; to fix: dpwvm, gicp or vmm"
         )
     return METHODS[name]
 
@@ -161,7 +171,9 @@ def normal_equations(
     old = overlaps.gram
     weights = method.weigh(overlaps.matches, capture, poses)
     surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
-    sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
+    if method.classes:
+        surfaces = class_variances(surfaces, overlaps.matches, weights)
+    sums = OffsetSums(surfaces, overlaps.matches, weights, capture) if method.offsets else None
     if sums is not None:
         surfaces = replace(surfaces, square=sums.square)
     g = append_targets(surfaces, overlaps.targets, capture.noise_factor)

@@ -1,5 +1,6 @@
 """result.json, ledger.json and the model of a run, as plain data, and what is read of them again."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -40,6 +41,7 @@ from stitch.output.schema import (
 )
 from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
 from stitch.session.measurement import Measurement
+from stitch.session.scan import Stock
 from stitch.session.session import SessionData, View
 from stitch.system.packages import stitch_version
 
@@ -54,6 +56,15 @@ class ViewRow(NamedTuple):
     correction: Array  # (6,) twist in the reference frame, rad and length_unit
     rms: float | None  # length_unit; null without partners, and of a view that is not fused
     points: int = 0
+
+
+class StockRow(NamedTuple):
+    """Stock as result.json lists it: taken off a view's scan, where it stood off from the others."""
+
+    view: str
+    thickness: float  # length_unit, outwards
+    sigma: float
+    share: float  # of the scan's surface
 
 
 def result_document(run: RunData) -> dict[str, Any]:
@@ -283,6 +294,20 @@ def _all_views(run: RunData) -> list[ViewRow]:
     return [rows[place] for place in sorted(rows)]
 
 
+def _stock_rows(run: RunData) -> list[StockRow]:
+    """Return the stock that was taken off the scans."""
+    scans = zip(run.session.names, run.measurement.capture.scans, strict=False)
+    found = [(name, scan.stock) for name, scan in scans if scan.stock is not None]
+    return [StockRow(name, stock.thickness, stock.sigma, stock.share) for name, stock in found]
+
+
+def stock_of_views(document: dict[str, Any], names: Sequence[str]) -> dict[int, Stock]:
+    """Return the stock that the run of a result took off, by the place of its view among some names; no points yet."""
+    rows = [StockRow(**row) for row in document.get("stock", ())]
+    nowhere = np.zeros(0, bool)
+    return {names.index(r.view): Stock(r.thickness, r.sigma, r.share, nowhere) for r in rows if r.view in names}
+
+
 def _axis_rows(run: RunData) -> list[dict[str, Any]]:
     """Return where the axes stand; a sigma is null where the views do not show it."""
     return [{key: plain(value) for key, value in vars(place).items() if value is not None} for place in run.axes]
@@ -358,6 +383,7 @@ _ALONE = Document(
     Key("spread", NUMBER),
 )
 _SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
+_STOCK = Document(Key("view", TEXT), *(Key(name, NUMBER) for name in ("thickness", "sigma", "share")))
 _LEFT_OUT = Document(Key("view", TEXT), Key("why", TEXT))
 _WEAK = Document(
     Key("view", TEXT, write=itemgetter(0)),
@@ -406,6 +432,7 @@ RESULT = Document(
     Key("axes", write=_axis_rows, when=attrgetter("session.axes")),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
+    Key("stock", _STOCK.rows(), write=_stock_rows, when=_stock_rows),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
     Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),

@@ -21,6 +21,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output import result_document as results
 from stitch.output.schema import read_checked
 from stitch.run_data import Fit, FusedCloud, LedgerStep, RunData
+from stitch.screening.stock import locate_stock
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
@@ -131,7 +132,13 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         session = session.without(excluded)
         model = bind_to_session(file, measurement)
         measurement = results.restore_counted_targets(measurement, session, document)
-        gate = gate_of_model(corrected_capture(measurement, model), model.T_mount)
+        capture = corrected_capture(measurement, model)
+        gate = gate_of_model(capture, model.T_mount)
+        if stock := results.stock_of_views(document, session.names):
+            # Of what was taken off, where it was is found again.
+            stock = locate_stock(session, capture, model.T_mount, gate, stock)
+            measurement = replace(measurement, capture=measurement.capture.without_stock(stock))
+            gate = gate_of_model(capture.without_stock(stock), model.T_mount)
     return RunData(
         session=session,
         measurement=measurement,

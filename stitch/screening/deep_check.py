@@ -36,6 +36,7 @@ from stitch.screening.plausibility import (
 from stitch.screening.pose_tests import length_problem
 from stitch.screening.problems import SessionProblem, likeliest_text, list_views
 from stitch.screening.snooping import Snooping, snoop_views
+from stitch.screening.stock import find_stock, stock_problems
 from stitch.screening.target_checks import check_targets, target_problems
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture, part_size, sightings_of
@@ -98,6 +99,9 @@ def _check_views(
 ) -> tuple[list[SessionProblem], bool]:
     """Return problems of single views under the stated poses, and True if these contradict the scans altogether."""
     T_mount, snooping = _snoop_from_start(session, capture, *_starting_hand_eye(session, capture, ranked))
+    while stock := find_stock(session, capture, T_mount, snooping):
+        capture = capture.without_stock(stock)
+        T_mount, snooping = _snoop_from_start(session, capture, T_mount, snooping.unconstrained.overlaps.gate)
     columns = snooping.blunder_search.mean_columns
     lengths = length_problem(snooping.model, capture.T_reference_mount, columns)
     if lengths is not None:
@@ -114,6 +118,7 @@ def _check_views(
     for m in snooping.suspected:
         off = suspicion_in_words(session, m)
         problems.append(problem("suspected", [session.names[m.view]], certain=False, off=off))
+    problems += stock_problems(session, capture)
     return problems + background_problems(session, capture, T_mount, snooping), contradicted
 
 

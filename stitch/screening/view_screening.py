@@ -3,7 +3,7 @@
 A rig is fitted, its views are examined, what does not belong is left out, and the rest is fitted again.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -37,10 +37,12 @@ from stitch.screening.pose_tests import MAX_VIEWS_WITH_EFFECTS, length_problem
 from stitch.screening.problems import list_views
 from stitch.screening.scan_faults import find_identical
 from stitch.screening.snooping import Snooping, snoop_views
+from stitch.screening.stock import find_stock, stock_problems
 from stitch.screening.target_checks import check_targets, target_warnings
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
+from stitch.session.scan import Stock
 from stitch.session.session import SessionData
 from stitch.system.process import announce
 
@@ -57,6 +59,7 @@ class ViewScreening:
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
     hand_eye: HandEyeTransfer | None = None  # of a given one, against that of the views
+    stock: Mapping[int, Stock] = field(default_factory=dict)  # that has to be taken off before anything else is asked
 
     @property
     def names(self) -> set[str]:
@@ -105,8 +108,13 @@ def fit_screened_views(
     taken = [ViewScreening() for _ in sessions]
     for _ in range(_MAX_ROUNDS):
         with _naming_excluded_views(sessions, taken):
-            fitted = fit(left, measured)
-            screenings = [_screen_session(session, fitted, i) for i, session in enumerate(left)]
+            fitted, screenings = _fit_and_screen(left, measured, fit)
+            while any(screening.stock for screening in screenings):
+                measured = [
+                    replace(m, capture=m.capture.without_stock(screening.stock))
+                    for m, screening in zip(measured, screenings, strict=True)
+                ]
+                fitted, screenings = _fit_and_screen(left, measured, fit)
         taken = [
             replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, screenings, strict=True)
         ]
@@ -126,6 +134,15 @@ def fit_screened_views(
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(left, measured)
     return ScreenedFit(left, measured, fitted, taken)
+
+
+def _fit_and_screen(
+    sessions: Sequence[SessionData],
+    measurements: Sequence[Measurement],
+    fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
+) -> tuple[FittedRig, list[ViewScreening]]:
+    fitted = fit(sessions, measurements)
+    return fitted, [_screen_session(session, fitted, i) for i, session in enumerate(sessions)]
 
 
 @contextmanager
@@ -163,6 +180,8 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
     if correction.given:
         require_matching_hand_eye(session, correction, index)
     snooping = _snoop_session(session, measurement, correction, index)
+    if stock := find_stock(session, capture, T_mount, snooping):
+        return ViewScreening(stock=stock)
     if poses_contradict_scans(session, snooping):
         refuse_contradiction(session, snooping, given=correction.given)
     lengths = length_problem(snooping.model, capture.T_reference_mount, snooping.blunder_search.mean_columns)
@@ -188,7 +207,12 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
             weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
         ),
-        doubts=(*target_warnings(session, capture.sightings), *_copies(session, capture, snooping), *warnings),
+        doubts=(
+            *target_warnings(session, capture.sightings),
+            *(found.fix for found in stock_problems(session, capture)),
+            *_copies(session, capture, snooping),
+            *warnings,
+        ),
     )
 
 
@@ -244,7 +268,8 @@ def session_warnings(
         return of_targets
     snooping = _snoop_session(session, measurement, correction, index)
     capture = correction.captures[index]
-    return (*of_targets, *snooping_warnings(session, capture, snooping, correction.geometry.T_mount))
+    warnings = snooping_warnings(session, capture, snooping, correction.geometry.T_mount)
+    return (*of_targets, *(found.fix for found in stock_problems(session, capture)), *warnings)
 
 
 def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:

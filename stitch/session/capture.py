@@ -3,7 +3,7 @@
 Labelled points stand in arrays of one shape: S slots a view, empty where a target was not seen.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +16,10 @@ from stitch.session.scan import (
     GRAZING_COSINE,
     Neighbourhoods,
     Scan,
+    Stock,
     find_neighbourhoods,
     prepare_scan,
+    without_stock,
 )
 from stitch.session.session import Cloud, SessionData
 from stitch.system.threads import parallel
@@ -118,6 +120,11 @@ class Capture:
     def hand_eye_frames(self, T_mount_scanner: Array) -> Array:
         """Return (V, 4, 4) whose adjoint carries a right perturbation of the hand-eye into the reference frame."""
         return self.T_reference_mount @ T_mount_scanner
+
+    def without_stock(self, stock: Mapping[int, Stock]) -> "Capture":
+        """Return the capture with stock taken off the scans of some views."""
+        of_views = enumerate(self.scans)
+        return replace(self, scans=tuple(without_stock(s, stock[v]) if v in stock else s for v, s in of_views))
 
     def without(self, left_out: Indices) -> "Capture":
         """Return the capture less some views."""

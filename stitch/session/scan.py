@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pykdtree.kdtree import KDTree
 
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array, Indices, Mask
 
 # Neighbours of a point's local plane: enough to average the noise, few enough to follow a fillet. To the quadric of the
 # noise estimate, of six coefficients, they leave ten degrees of freedom, and stay within one curve of the surface where
@@ -35,6 +35,16 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
+class Stock:
+    """A surface of a scan that stood off along its normals, as stock on a casting or a scanner's zero do."""
+
+    thickness: float  # length_unit, outwards
+    sigma: float
+    share: float  # of the scan's surface
+    points: Mask  # (N,) which of its points
+
+
+@dataclass(frozen=True)
 class Scan:
     """One view in the scanner frame, length_unit; arrays of N points, float64."""
 
@@ -49,6 +59,7 @@ class Scan:
     scanned_spacing: float  # the same between all points that were scanned, of which these may be some
     noise: float  # 1-sigma across the surface, from the scan itself
     eye: Array  # (3,) from where the scanner looks
+    stock: Stock | None = None  # taken off its points
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the tree out of pickles and copies: it is made of the points when it is asked for."""
@@ -91,6 +102,12 @@ class Neighbourhoods:
     index: Indices  # (n, k)
     radius: Array  # (n,) distance to the farthest of them
     spacing: float  # median distance to the nearest one, length_unit
+
+
+def without_stock(scan: Scan, stock: Stock) -> Scan:
+    """Return the scan with stock taken off: points on it moved back along their normals."""
+    points = scan.points - stock.thickness * stock.points[:, None] * scan.normals
+    return replace(scan, points=points, tree=KDTree(points, leafsize=16), stock=stock)
 
 
 def prepare_scan(

@@ -128,7 +128,7 @@ def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path
 
 def test_a_method_of_another_name_is_bad_input(session):
     with pytest.raises(
-        InputError, match="register icp: no method has this name; did you mean .gicp.*to fix: dpwvm or gicp"
+        InputError, match="register icp: no method has this name; did you mean .gicp.*to fix: dpwvm, gicp or vmm"
     ):
         run(load_session(session), register="icp")
     with pytest.raises(SystemExit) as ended:

@@ -1,6 +1,7 @@
 """The weights of correspondences, against closed forms: planes with a common offset, two classes, order of views."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from stitch.fusion.correspondence_weights import (
     OffsetSums,
     class_scale,
+    class_variances,
     dpwvm_weights,
     eliminate,
     shared_offsets,
@@ -19,6 +21,7 @@ from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps, gram
 
 COUNT, VARIANCE = 400, 1e-4
+WITHOUT_STOCK = SimpleNamespace(scans=[SimpleNamespace(stock=None)] * 2)
 
 
 def faces(normals, offset, t=(0.0, 0.0, 0.0)):
@@ -41,7 +44,7 @@ def sums_of(match, moving=1e-1):
     weights = [np.ones(len(match.residual))]
     g = gram([match], 2, np.zeros(3), 0.01, weights)
     prior = np.diag([1e12] * 3 + [moving] * 3)
-    return g.matrix[0] / VARIANCE + prior, g.vector[0] / VARIANCE, OffsetSums(g, [match], weights)
+    return g.matrix[0] / VARIANCE + prior, g.vector[0] / VARIANCE, OffsetSums(g, [match], weights, WITHOUT_STOCK)
 
 
 def both(H, b):
@@ -131,3 +134,37 @@ def test_an_offset_is_free_only_where_it_is_sure_and_large():
 def test_full_weight_at_agreement_and_none_beyond_the_limit():
     e = np.array([0.0, 4.685, -4.685, 9.0, 4.685 / 2, -4.685 / np.sqrt(2)])
     assert tukey(0.7 * e, 0.7) == pytest.approx([1, 0, 0, 0, 9 / 16, 1 / 4])
+
+
+def test_classes_are_summed_as_the_variance_of_each():
+    """Value and slope of N/2·(Var₊ + Var₋) of one pair, against NumPy's variance and central differences."""
+    match = faces([[1, 0, 0], [0, 1, 0]], 0.002, (0.01, -0.02, 0.005))
+    weight = np.random.default_rng(2).uniform(0.5, 1.0, len(match.residual))
+    plus = match.residual >= 0
+
+    def cost(shift):
+        moved = match.residual + match.normal @ shift
+        variances = [np.cov(moved[side], aweights=weight[side], ddof=0) for side in (plus, ~plus)]
+        return weight.sum() / 2 * float(np.sum(variances))
+
+    g = class_variances(gram([match], 2, np.zeros(3), 0.01, [weight]), [match], [weight])
+    assert g.square[0] == pytest.approx(cost(np.zeros(3)))
+    steps = 1e-5 * np.eye(3)
+    slope = [(cost(step) - cost(-step)) / 2e-5 for step in steps]
+    assert 2 * g.vector[0, 3:] == pytest.approx(slope, rel=1e-6)
+
+
+def test_an_offset_on_a_part_of_a_scan_acts_there_alone():
+    """A third of the points stands off: with it free the others say where the view is, as if there were only these."""
+    match = faces([[1, 0, 0], [0, 1, 0], [0, 0, 1]], 0.0, (0.03, -0.01, 0.02))
+    raised = np.arange(len(match.residual)) % 3 == 0
+    scans = [SimpleNamespace(stock=SimpleNamespace(points=raised)), SimpleNamespace(stock=None)]
+    known = replace(match, residual=match.residual + 0.3 * raised)
+    weights = [np.ones(len(raised))]
+    g = gram([known], 2, np.zeros(3), 0.01, weights)
+    sums = OffsetSums(g, [known], weights, SimpleNamespace(scans=scans))
+    assert sums.known == [0]
+    H, b = both(g.matrix[0] / VARIANCE + np.diag([1e12] * 3 + [1e-1] * 3), g.vector[0] / VARIANCE)
+    H, b, offsets = with_offsets(H, b, sums, VARIANCE, 0.01)
+    assert np.linalg.solve(H, -b)[3:6] == pytest.approx([-0.03, 0.01, -0.02], abs=2e-3)
+    assert offsets == {}

@@ -159,7 +159,7 @@ def test_register_takes_other_weights(cell):
 
 
 def test_both_methods_stand_by_their_names():
-    assert list(METHODS) == ["dpwvm", "gicp"]
+    assert list(METHODS) == ["dpwvm", "gicp", "vmm"]
     assert all(name == method.name for name, method in METHODS.items())
 
 

@@ -1,0 +1,63 @@
+"""Stock on one view, against nature's castings: said with its thickness; a displaced or torn view never is."""
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+import stitch
+from data_synth.fixtures import quiet_scenes
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from data_synth.shapes.casting import with_stock
+from data_synth.write import write_session
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+
+CELL = {"seed": 2, "views": 10, "pixels": 80}
+VIEW = 8
+
+
+def with_casting(size, share):
+    """The cell in which one view saw so much stock on a share of the blade, from its foot on."""
+    mesh_for = quiet_scenes.mesh_for
+
+    def grown(scene):
+        mesh = mesh_for(scene)
+        axis = int(np.argmax(mesh.extents))
+        lowest = mesh.bounds[0, axis]
+        return with_stock(mesh, lambda places: size * (places[:, axis] <= lowest + share * mesh.extents[axis]))
+
+    measured = measured_blade(**CELL)
+    with patch("data_synth.fixtures.quiet_scenes.mesh_for", grown):
+        raised = measured_blade(**CELL).clouds[VIEW]
+    return replace(measured, clouds=[raised if v == VIEW else cloud for v, cloud in enumerate(measured.clouds)])
+
+
+def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
+    """It is taken off where it is; a run that was saved knows it again."""
+    write_session(tmp_path / "session", with_casting(0.2, 0.5), "blade")
+    found = stitch.run(stitch.load_session(tmp_path / "session"))
+    (scan,) = (scan for scan in found.measurement.capture.scans if scan.stock is not None)
+    assert found.session.names[found.measurement.capture.scans.index(scan)] == "v008"
+    assert abs(scan.stock.thickness - 0.2) < 3 * scan.stock.sigma < 0.03
+    assert found.left_out == ()
+    assert "v008 shows its surface" in found.doubts[0] and "outside" in found.doubts[0]
+    found.save(tmp_path / "run")
+    (again,) = (s for s in stitch.load_run(tmp_path / "run").measurement.capture.scans if s.stock is not None)
+    assert again.stock.thickness == pytest.approx(scan.stock.thickness)
+    assert np.mean(again.stock.points == scan.stock.points) > 0.98
+
+
+@pytest.mark.parametrize("turn", [0.0, 3e-3])
+def test_a_displaced_view_is_never_called_stock(turn):
+    measured = measured_blade(**CELL)
+    T = np.array(measured.T_base_flange)
+    T[VIEW] = T[VIEW] @ frames.exp(np.array([turn, 0, 0, 0.1, 0.2, -0.2]))
+    found = run(session_of(replace(measured, T_base_flange=T)))
+    assert not any("stock" in doubt for doubt in found.doubts)
+
+
+def test_a_clean_session_has_no_stock():
+    assert run(session_of(measured_blade(**CELL))).doubts == ()
