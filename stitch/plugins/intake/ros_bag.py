@@ -282,7 +282,7 @@ def read_bag(path: Path) -> BagContents:
             message = reader.deserialize(raw, connection.msgtype)
             topic, kind = connection.topic, connection.msgtype
             if kind in _TF:
-                out.edges += [_transform_recording(t, "static" in topic) for t in message.transforms]
+                out.edges += [transform_recording(t, "static" in topic) for t in message.transforms]
             elif kind == _JOINTS:
                 angles = {n: float(q) for n, q in zip(message.name, message.position, strict=False)}
                 out.joints.append((message_time(message.header, stamp), angles))
@@ -303,7 +303,8 @@ def message_time(header: Any, recorded_ns: int) -> float:
     return stamp or 1e-9 * recorded_ns
 
 
-def _transform_recording(message: Any, static: bool) -> Recording:
+def transform_recording(message: Any, static: bool) -> Recording:
+    """Return what a TransformStamped says: time, parent, child, T_parent_child (4, 4), m, and whether it is fixed."""
     turn, shift = message.transform.rotation, message.transform.translation
     R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
     T = frames.make(R, np.array([shift.x, shift.y, shift.z]))

@@ -1,0 +1,1 @@
+"""stitch in a ROS 2 cell."""
