@@ -14,7 +14,11 @@ from tests.plugins.intake.test_ros_bag import Messages
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 ROS2 = Path(__file__).resolve().parents[1] / "examples" / "ros2"
-KINDS = {"/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage", "points": "sensor_msgs/msg/PointCloud2"}
+KINDS = {
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "points": "sensor_msgs/msg/PointCloud2",
+}
 VIEWS, STAND, MOVE, START = 6, 1.0, 1.0, 100.0
 MM = 1e-3
 

@@ -1,5 +1,6 @@
 """The part as a shaded surface, and how the patches of the field colour it."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from stitch.output.comparison.disagreement_field import Patches
 from stitch.output.mesh import TriangleMesh, mesh_of, spacing
 from stitch.run_data import FusedCloud
 from stitch.session.scan import even_indices
+from stitch.system.packages import unless_missing
 from stitch.system.threads import take_mapped
 
 # From where the part is looked at: what is long stands upright, and the side that shows most comes to the front.
@@ -122,12 +124,10 @@ def part_shape(fused: FusedCloud) -> PartShape:
     """The fused cloud as a mesh."""
     points, normals = _thinned(fused)
     triangles = np.zeros((0, 3), np.int64)
-    try:
+    with suppress(NoResultError), unless_missing():
         mesh = _drawn_in(mesh_of(points, normals, _OUTSIDE), points, normals)
         points, triangles = _level_edges(*_whole_pieces(mesh))
         normals = vertex_normals(points, triangles)
-    except NoResultError:
-        pass
     return PartShape(points, normals, triangles)
 
 

@@ -35,7 +35,7 @@ PACKAGES = {
     "natsort": ("natsort", "init: the order of files"),
     "pyarrow": ("pyarrow", "residuals.parquet"),
     "jsonschema": ("jsonschema", "the check of result.json when a run is read again"),
-    "libigl": ("igl", "--mesh, measure, fit, seam"),
+    "libigl": ("igl", "the part as a surface, --mesh, measure, fit, seam"),
     "kiss-icp": ("kiss_icp", "the start of the hand-eye of a scanner that never stops"),
     "trimesh": ("trimesh", "scans as meshes, CAD, the simulator"),
     "embreex": ("embreex", "a simulator of full speed"),

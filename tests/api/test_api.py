@@ -261,6 +261,13 @@ def kinect():
     return {"pyk4a": Made(PyK4A=lambda: camera)}
 
 
+def orbbec():
+    frames = {1000: "frames"}
+    cloud = Made(process={"frames": "points"}.get, calculate={"points": image(0).reshape(-1, 3)}.get)
+    pipeline = Made(start=lambda: None, wait_for_frames=frames.get)
+    return {"pyorbbecsdk": Made(Pipeline=lambda: pipeline, PointCloudFilter=lambda: cloud)}
+
+
 def gocator():
     """GoSdk: a grid of 0.5 mm, heights in steps of 20 µm from 400 mm on."""
     counts = np.where(EMPTY, -32768, np.round((surface()[..., 2] - 400) / 0.02)).astype(np.int16)
@@ -281,6 +288,7 @@ SCANNERS = {
     "Mech-Eye": (mecheye, 1e-4),
     "Gocator": (gocator, 0.0101),  # half a step
     "Azure Kinect": (kinect, 0.5),
+    "Orbbec": (orbbec, 1e-4),
 }
 
 
@@ -397,6 +405,17 @@ def written(robot, rows):
     assert len(number.findall(line)) == rows.shape[1]
     form = number.sub("{:.9f}", line.replace("{", "{{").replace("}", "}}"))
     return "".join(f"scan{i}.ply {form.format(*row)}\n" for i, row in enumerate(rows))
+
+
+def test_a_pose_by_rtde_is_that_of_the_controller(monkeypatch):
+    told = [0.837754, 0.184587, 0.675455, 2.891104, 0.321870, -0.117293]
+    receiver = Made(getActualTCPPose=lambda: told)
+    monkeypatch.setitem(sys.modules, "rtde_receive", Made(RTDEReceiveInterface=lambda host: receiver))
+    names = {}
+    exec(compile(block("RTDE"), "RTDE", "exec"), names)
+    (T,) = poses_of([names["flange_pose"]()], "poses")
+    assert np.abs(T[:3, :3] - Rotation.from_rotvec(told[3:]).as_matrix()).max() < 1e-12
+    assert np.abs(T[:3, 3] - 1e3 * np.array(told[:3])).max() < 1e-9
 
 
 @pytest.mark.parametrize("robot", ["KUKA", "ABB", "FANUC", "Universal Robots"])
