@@ -11,11 +11,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
-from stitch_ros.live_cell import LiveCell
 from tf2_msgs.msg import TFMessage
 from tf2_ros import StaticTransformBroadcaster
 
 from stitch import StitchError
+from stitch_ros.live_cell import LiveCell
 
 
 class LiveCellNode(Node):
