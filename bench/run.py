@@ -45,6 +45,7 @@ TABLES = {
     "mount-droop": "foreign_laws:DROOP",
     "mount-laws": "foreign_laws:MOUNT",
     "no-mistake": "integrity:GOOD",
+    "odd": "odd:TABLE",
     "ordinary-arms": "hand_eye_sigmas:ORDINARY_ARMS",
     "panel": "panel:TABLE",
     "peers": "speed:PEERS",
