@@ -26,6 +26,7 @@ TABLES = {
     "deciding-view": "deciding_view:TABLE",
     "degenerate": "degenerate:TABLE",
     "diagnose-time": "speed:DIAGNOSE",
+    "doors": "doors:TABLE",
     "drilling": "drilling:TABLE",
     "expected-chances": "metrology:CHANCES",
     "faults": "faults:TABLE",

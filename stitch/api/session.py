@@ -123,6 +123,12 @@ class Session(SessionData):
             <session>: the poses contradict what was measured: inverse: the poses are T_flange_base, ...
         """
         cell = cls.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
+        _require_kinds({"covariates": covariates}, Mapping | None)
+        _require_kinds({"clouds": clouds}, Mapping | Sequence | np.ndarray | None)
+        _require_kinds({"points": points}, Sequence | np.ndarray | None)
+        _require_kinds({"axes": axes}, Sequence)
+        _require_kinds({"check": check}, bool)
+        _require_kinds({f"axes, {k}": table for k, table in enumerate(axes)}, Mapping)
         with _in_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
             has_poses = poses is not None or joints is not None or not axes
@@ -157,6 +163,10 @@ class Session(SessionData):
             >>> stitch.Session.empty(mount="eye_in_hand", name="bracket").views
             ()
         """
+        _require_kinds({"name": name, "unit": unit, "mount": mount}, str)
+        _require_kinds({"cloud_unit": cloud_unit}, str | None)
+        _require_kinds({"scanner": scanner}, Scanner | Mapping | None)
+        _require_kinds({"robot": robot}, Robot | Mapping | Path | str | None)
         path = Path(f"<{require_folder_name('name', name, 'name')}>")
         # Checked as a session.toml with the same entries is.
         toml = path / "session.toml"
@@ -244,6 +254,14 @@ def public_session(session: SessionData) -> Session:
     if isinstance(session, Session):
         return session
     return Session(**{f.name: getattr(session, f.name) for f in fields(SessionData)})
+
+
+def _require_kinds(arguments: Mapping[str, Any], kinds: Any) -> None:
+    """Refuse arguments, by name, that are none of some types."""
+    for name, value in arguments.items():
+        if not isinstance(value, kinds):
+            words = " or ".join(kind.__name__ for kind in get_args(kinds) or (kinds,)).replace("NoneType", "None")
+            raise InputError(f"{name}: is of type {type(value).__name__}; to fix: pass {words}")
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:

@@ -140,6 +140,15 @@ def test_scans_that_lie_in_one_frame_already_are_refused(cell, arrays):
         ),
         ({"covariates": {"hu\nmidity": np.ones(5)}}, "covariates: covariate 'hu\\nmidity' holds the character"),
         ({"points": [{"a\nb": np.ones(3)}] * 5}, "view v000: target 'a\\nb' holds the character"),
+        ({"points": [np.ones(3)] * 5}, "view v000: labelled points are of type ndarray"),
+        ({"name": 5}, "name: is of type int; to fix: pass str"),
+        ({"unit": np.ones(3)}, "unit: is of type ndarray; to fix: pass str"),
+        ({"scanner": 0.5}, "scanner: is of type float; to fix: pass Scanner or Mapping or None"),
+        ({"covariates": np.ones(5)}, "covariates: is of type ndarray; to fix: pass Mapping or None"),
+        ({"axes": [5]}, "axes, 0: is of type int; to fix: pass Mapping"),
+        ({"check": np.ones(2)}, "check: is of type ndarray; to fix: pass bool"),
+        ({"times": np.ones(5, complex)}, "times: complex numbers"),
+        ({"poses": np.ones((5, 4, 4), complex)}, "poses: poses are not all matrices"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(arrays, loaded, change, says):

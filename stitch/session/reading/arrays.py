@@ -249,7 +249,9 @@ def _matrices(poses: Any, where: str) -> Array:
                 hasattr(p, "as_matrix") or (isinstance(p, tuple) and isinstance(p[0], Rotation)) for p in poses
             ]
             poses = [_matrices(p, where) if o else _unmasked(p) for p, o in zip(poses, is_object, strict=True)]
-        return np.array(_unmasked(poses), float)
+        if np.iscomplexobj(matrices := np.asarray(_unmasked(poses))):
+            raise TypeError
+        return matrices.astype(float)
     except (TypeError, ValueError):
         raise InputError(
             f"{where}: poses are not all matrices (4, 4); to fix: pass (V, 4, 4), RigidTransform, "
@@ -278,6 +280,8 @@ def sighting_of(item: Any, where: str) -> Sighting | None:
     """
     if item is None or isinstance(item, Sighting):
         return item
+    if not isinstance(item, Mapping):
+        raise InputError(f"{where}: labelled points are of type {type(item).__name__}; to fix: pass {{target: (3,)}}")
     if not item:
         return None
     points = np.array([np.asarray(place, float) for place in item.values()])
@@ -297,6 +301,8 @@ def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
         found = _unmasked(values)
         if found.dtype.kind in "mM":
             raise InputError(f"{where}: dates or durations, not numbers; to fix: pass numbers in one unit")
+        if found.dtype.kind == "c":
+            raise InputError(f"{where}: complex numbers; to fix: pass their real part")
         found = found.astype(float)
     except (TypeError, ValueError):
         found = np.zeros((0,))
