@@ -15,6 +15,8 @@ from bench.harness import Row, Table, grouped, markdown, share
 from bench.laws_world import Array, World, draw_world, measured
 from stitch.api.session import Session
 from stitch.api.verbs import diagnose, run
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.score import beyond_expected, expected_scatter, scatter_limit
 from stitch.diagnosis.systematic_laws import law_of
 
 SIZES = (1.0, 3.0)
@@ -237,3 +239,32 @@ def summary(rows: list[Row]) -> list[str]:
 
 
 TABLE = Table(jobs, trial, summary, range(1))
+
+
+def scatter_jobs(seeds: range) -> Iterator[Row]:
+    """Every law at both sizes for each seed, and as many worlds in which nothing is wrong, of four cells one in clouds."""
+    for job in jobs(seeds):
+        yield job
+        yield job | {"size": 0.0}
+
+
+def scatter_trial(job: Row) -> Row:
+    """Return whether more is left than the scatter of an ordinary arm explains, whatever a diagnosis says of it."""
+    result = run(cell(job["law"], job["kind"], job["size"], job["seed"])[0])
+    linear = linear_model_of(result)
+    more = beyond_expected(linear, expected_scatter(linear, scatter_limit(result.session)))
+    return {"more": more, "times": 1e3 * result.residual_rms / EXPECTED_UM[job["kind"]]}
+
+
+def scatter_summary(rows: list[Row]) -> list[str]:
+    """Return how often more is left than expected, by what is left."""
+    groups = {
+        "nothing is wrong": [row for row in rows if not row["size"]],
+        "a law, up to twice what is left without one": [r for r in rows if r["size"] and r["times"] <= 2],
+        "a law, more than twice": [row for row in rows if row["size"] and row["times"] > 2],
+    }
+    lines = [[name, share(row["more"] for row in group)] for name, group in groups.items()]
+    return markdown("in the cell | not adequate by its scatter alone", lines)
+
+
+SCATTER = Table(scatter_jobs, scatter_trial, scatter_summary, range(6800, 6802), "diagnosis", "expected-scatter")

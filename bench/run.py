@@ -28,6 +28,7 @@ TABLES = {
     "diagnose-time": "speed:DIAGNOSE",
     "doors": "doors:TABLE",
     "drilling": "drilling:TABLE",
+    "expected-scatter": "laws_everywhere:SCATTER",
     "expected-chances": "metrology:CHANCES",
     "faults": "faults:TABLE",
     "features": "metrology:FEATURES",

@@ -12,7 +12,7 @@ from stitch.diagnosis.evidence import find_scanner_error, gather_evidence, overl
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, rank_one
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import follows_field, variance_budget
-from stitch.diagnosis.score import scatter_limit
+from stitch.diagnosis.score import expected_scatter, scatter_limit
 from stitch.diagnosis.sensitivity import (
     alias_matrix,
     aliases_of,
@@ -91,6 +91,8 @@ def _diagnose(state: RunData) -> Diagnosis:
         coincidence=evidence.coincidence,
         scatter_limit=limit,
         implausible=evidence.implausible_scatter,
+        expected_scatter=expected_scatter(linear, limit),
+        beyond_expected=evidence.beyond_expected,
         repeating_errors=repeating,
         curves=joint_curves([effect for error in repeating for effect in error.joint_effects]),
         log_odds_over_nothing=evidence.log_odds_over_nothing,

@@ -98,8 +98,10 @@ class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_docu
     depends_on: tuple[Dependence, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
     linear: LinearModel
-    scatter_limit: ScatterLimit  # what "adequate" is measured against
+    scatter_limit: ScatterLimit  # that no sound arm exceeds, or that is stated
     implausible: bool  # the poses scatter by more than that
+    expected_scatter: ScatterLimit  # that is stated, or of an ordinary arm
+    beyond_expected: bool  # the views show more than that leaves
     next: tuple[Proposal, ...] = ()  # what to measure next, once `stitch.diagnose` has planned it
     notes: tuple[str, ...] = ()
     repeating_errors: tuple[RepeatingError, ...] = ()  # kinds of errors that repeat, where nothing is named

@@ -29,7 +29,7 @@ from stitch.diagnosis.ranking import (
     stands_out,
 )
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import ScatterLimit, implausible, score
+from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
 from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
 from stitch.diagnosis.unmodelled_time_effects import (
@@ -103,7 +103,13 @@ def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: S
 def _propose_names(case: Case, limit: ScatterLimit) -> Evidence:
     ranked, empirical = rank_all(case.linear, case.candidates)
     laws = rank_laws(case.linear, case.dictionary)
-    evidence = Evidence(ranked, empirical, laws=laws, implausible_scatter=implausible(case.linear, limit))
+    evidence = Evidence(
+        ranked,
+        empirical,
+        laws=laws,
+        implausible_scatter=implausible(case.linear, limit),
+        beyond_expected=beyond_expected(case.linear, expected_scatter(case.linear, limit)),
+    )
     return ask(NAMING, case, evidence)
 
 

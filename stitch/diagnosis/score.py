@@ -27,10 +27,11 @@ from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.numerics.distributions import chi2_limit, f_tail
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.parameter_selection import log_evidence_at_scales, log_mixture
-from stitch.numerics.reml import FurtherColumns, at_variances, fit_variances
+from stitch.numerics.reml import NOISE, FurtherColumns, at_variances, fit_variances
 from stitch.numerics.units import METRES
 from stitch.numerics.variance_posterior import satterthwaite
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import USUAL_JOINT_SCATTER, usual_twist
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
 from stitch.system.threads import parallel
@@ -299,6 +300,35 @@ def scatter_limit(session: SessionData) -> ScatterLimit:
         rotation_stated=stated.sigma_rotation is not None,
         translation_stated=stated.sigma_translation is not None,
     )
+
+
+def expected_scatter(linear: LinearModel, limit: ScatterLimit) -> ScatterLimit:
+    """Return what the poses may scatter by: as stated, else what the flange and joints of an ordinary arm do together."""
+    flange = usual_twist(linear.measurement.length_unit)[[0, 3]]
+    usual = np.sqrt(flange**2 + USUAL_JOINT_SCATTER**2 * linear.flange_per_joint)
+    rotation, translation = (limits.ORDINARY_SCATTER * usual).tolist()
+    return replace(
+        limit,
+        rotation=limit.rotation if limit.rotation_stated else rotation,
+        translation=limit.translation if limit.translation_stated else translation,
+    )
+
+
+def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
+    """Return whether the views show more than an expected scatter leaves, and chance explains.
+
+    Rotations and translations count together, as far as each of them moves what is seen: these views may not tell
+    them apart. All that is left counts as scatter, what follows a law too.
+    """
+    linear = linear.restricted(())
+    shown = np.trace(linear.mixed.components[:NOISE], axis1=2, axis2=3).sum(axis=1)
+    variances = linear.null.variances.copy()
+    variances[:NOISE] = expected.rotation**2, expected.translation**2
+    shares = variances[:NOISE] * shown / max(float(variances[:NOISE] @ shown), 1e-300)
+    spread = satterthwaite(linear.mixed, at_variances(linear.mixed, variances)).spread[:NOISE, :NOISE]
+    known = 2 / max(float(shares @ spread @ shares), 1e-9)
+    ratio = float(linear.null.variances[:NOISE] @ shown) / max(float(variances[:NOISE] @ shown), 1e-300)
+    return ratio > chi2_limit(limits.ALPHA_UNKNOWN / 2, known) / known
 
 
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:

@@ -47,11 +47,7 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     if d.rotation > 0 or d.translation > 0:
         scatter = _scatter(d.translation, d.rotation, length_unit)
         yield f"The robot's poses scatter by {scatter} (1 σ), which explains the rest."
-        limits = _scatter(d.scatter_limit.translation, d.scatter_limit.rotation, length_unit)
-        if d.scatter_limit.stated:
-            yield f"The stated repeatability allows {limits}."
-        else:
-            yield f"No repeatability is stated under [robot]; usual arms stay below {limits}."
+        yield _allowed(d, length_unit)
     if d.scanner_error is not None:
         calibration = "" if d.scanner_error.by_view else ", but a calibration may"
         yield f"{scanner_error_sentence(d.scanner_error, length_unit)} No pose corrects that{calibration}."
@@ -152,6 +148,8 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
     elif not d.implausible:
         shown = d.rotation > 0 or d.translation > 0
         yield f"The poses scatter by {scatter}." if shown else "The measured points do not show the poses."
+        if d.beyond_expected:
+            yield f"{_allowed(d, length_unit)} So more is left than scatter explains."
     elif d.overlap_misfit:
         yield f"The poses scatter by {scatter}; how much of that is the robot's shows once the misfit is corrected."
     else:
@@ -159,6 +157,14 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
         limit = f"{'stated' if d.scatter_limit.stated else 'usual'}: up to {limits}"
         yield f"The robot's pose errors dominate: they scatter by {scatter} ({limit})."
         yield "Such errors repeat at the same poses, so a correction found on one object holds for another."
+
+
+def _allowed(d: Diagnosis, length_unit: str) -> str:
+    """Say by how much poses may scatter."""
+    limits = _scatter(d.expected_scatter.translation, d.expected_scatter.rotation, length_unit)
+    if d.expected_scatter.stated:
+        return f"The stated repeatability allows {limits}."
+    return f"No repeatability is stated under [robot]; ordinary arms stay below {limits}."
 
 
 def _laws_in_words(d: Diagnosis) -> list[str]:

@@ -48,6 +48,7 @@ class Evidence:
     scanner_error: FieldError | None = None
     repeating_errors: tuple[RepeatingError, ...] | None = None  # pose errors without a name; None: not asked
     implausible_scatter: bool = False  # the poses scatter by more than is stated, or than any sound arm does
+    beyond_expected: bool = False  # the views show more than the scatter that is stated, or of an ordinary arm, leaves
     # of effects that may be named, beside all that each was named beside
     left_out: Mapping[str, CrossValidation] = field(default_factory=dict)
     overlap_misfit: float = 0.0  # rms that no motion of the views removes, where it exceeds the noise; length_unit
@@ -74,7 +75,7 @@ class Evidence:
         if self.explanation and without_rival:
             return "missing_effect" if len(self.explanation) == 1 and not self.rival_laws else "cannot_tell"
         scanner_errs = self.scanner_error is not None and self.scanner_error.over_noise
-        unexplained = self.alarm or self.repeating_errors or self.implausible_scatter
+        unexplained = self.alarm or self.repeating_errors or self.implausible_scatter or self.beyond_expected
         return "unknown_effect" if unexplained or scanner_errs or self.overlap_misfit > 0 else "adequate"
 
     @property

@@ -12,7 +12,7 @@ from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_ce
 from stitch.api.pipeline import change, diagnose, run
 from stitch.api.stepwise import suggest
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
-from stitch.diagnosis.score import scatter_limit
+from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, scatter_limit
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
 from stitch.diagnosis.systematic_laws import drivers_of
 from stitch.effects.empirical import FIELD, empirical_effects
@@ -268,6 +268,16 @@ def test_a_stated_repeatability_takes_the_place_of_the_usual_one(unit):
     assert usual.translation == pytest.approx(0.12 if unit == "mm" else 0.12e-3) and not usual.stated
     stated = scatter_limit(replace(session, length_unit=unit, repeatability=StatedRepeatability(position=0.1)))
     assert stated.translation < 0.1 and stated.stated and stated.rotation == usual.rotation
+
+
+@pytest.mark.parametrize(("scatter", "more"), [((2e-5, 0.02), False), ((8e-5, 0.08), True)])
+def test_four_times_the_scatter_of_an_ordinary_arm_is_more_than_expected(scatter, more):
+    """Nothing else is wrong with it: whoever knows that the arm is so states it."""
+    session, *_ = labelled_cell(5, views=24, scatter=scatter)
+    linear = linear_model_of(run(session))
+    assert beyond_expected(linear, expected_scatter(linear, scatter_limit(session))) == more
+    known = ScatterLimit(*scatter, rotation_stated=True, translation_stated=True)
+    assert not beyond_expected(linear, expected_scatter(linear, known))
 
 
 def test_scatter_beyond_what_is_stated_is_not_adequate():

@@ -44,6 +44,7 @@ REPEATS = (SimpleNamespace(words="wander"),)
         ("unknown_effect", {"alarm": True, "explanation": (ONE,), "scanner_error": LARGE}),
         ("unknown_effect", {"repeating_errors": REPEATS}),
         ("unknown_effect", {"implausible_scatter": True}),
+        ("unknown_effect", {"beyond_expected": True}),
         ("unknown_effect", {"scanner_error": LARGE}),
         ("unknown_effect", {"overlap_misfit": 0.1}),
         ("adequate", {"repeating_errors": (), "scanner_error": SMALL}),

@@ -27,13 +27,37 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "follows_field": False,
         "scanner_error": None,
         "laws": (),
-        "scatter_limit": ScatterLimit(2.5e-4, 0.12),
+        "expected_scatter": ScatterLimit(4.5e-5, 0.04),
+        "beyond_expected": False,
     }
     told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
     assert "20 µm and 0.02 mrad" in told and told.endswith("Not named: a note.")
     silent = diagnosis_sentence(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
     assert "13.2 µm" in silent and "mrad" not in silent and "scatter" not in silent
     assert silent.endswith("Not named: a note.")
+
+
+def test_more_than_an_expected_scatter_is_said_with_what_is_expected():
+    found = SimpleNamespace(
+        verdict="unknown_effect",
+        residual_rms=0.153,
+        noise_floor=0.02,
+        rotation=1e-4,
+        translation=0.09,
+        notes=(),
+        missing={},
+        depends_on=(),
+        implausible=False,
+        expected_scatter=ScatterLimit(4.5e-5, 0.04),
+        beyond_expected=True,
+        repeating_errors=(),
+        overlap_misfit=0.0,
+        follows_field=False,
+        scanner_error=None,
+        laws=(),
+    )
+    told = diagnosis_sentence(found, "mm", None)
+    assert "ordinary arms stay below 40 µm and 0.045 mrad. So more is left than scatter explains." in told
 
 
 NOT_FITTED = SimpleNamespace(fitted=False)
