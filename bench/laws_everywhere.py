@@ -242,7 +242,7 @@ TABLE = Table(jobs, trial, summary, range(1))
 
 
 def scatter_jobs(seeds: range) -> Iterator[Row]:
-    """Every law at both sizes for each seed, and as many worlds in which nothing is wrong, of four cells one in clouds."""
+    """Every law at both sizes for each seed, and as many worlds in which nothing is wrong."""
     for job in jobs(seeds):
         yield job
         yield job | {"size": 0.0}

@@ -303,7 +303,7 @@ def scatter_limit(session: SessionData) -> ScatterLimit:
 
 
 def expected_scatter(linear: LinearModel, limit: ScatterLimit) -> ScatterLimit:
-    """Return what the poses may scatter by: as stated, else what the flange and joints of an ordinary arm do together."""
+    """Return what the poses may scatter by: as stated, else what flange and joints of an ordinary arm do together."""
     flange = usual_twist(linear.measurement.length_unit)[[0, 3]]
     usual = np.sqrt(flange**2 + USUAL_JOINT_SCATTER**2 * linear.flange_per_joint)
     rotation, translation = (limits.ORDINARY_SCATTER * usual).tolist()

@@ -30,8 +30,8 @@ UNDETECTABLE_SQUARE = 1e6
 # No arm that is fit for use scatters more than this (rad, mm): several times the repeatability of data sheets
 # (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
 IMPLAUSIBLE = (2.5e-4, 0.12)
-# Times the scatter of a usual flange and usual joints together, up to which what is left is that of an ordinary arm. The
-# simulator's arms, with joints that scatter or without, have 0.4 to 0.9 of it.
+# Times the scatter of a usual flange and usual joints together, up to which what is left is that of an ordinary arm:
+# the simulator's arms, with joints that scatter or without, have 0.4 to 0.9 of it.
 ORDINARY_SCATTER = 1.3
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas (custom).
