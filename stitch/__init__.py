@@ -64,10 +64,7 @@ def __dir__() -> list[str]:
 @cache
 def _modules() -> dict[str, str]:
     """Public names and their modules: those of the core, and of plug-ins the verbs (entry-point group stitch.verbs)."""
-    verbs = {verb.name: verb.module for verb in _metadata().entry_points(group="stitch.verbs")}
+    # Read when it is asked for: it takes a third of the whole import.
+    metadata = import_module("importlib.metadata")
+    verbs = {verb.name: verb.module for verb in metadata.entry_points(group="stitch.verbs")}
     return dict(sorted((verbs | _CORE).items()))
-
-
-def _metadata() -> Any:
-    """Read when it is asked for: it takes a third of the whole import."""
-    return import_module("importlib.metadata")

@@ -194,7 +194,11 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
     laws, shares, said_by = list[Law](), list[float](), dict[tuple[str, str], frozenset[str]]()
     views = linear.measurement.views
     drivers = list(drivers_of(views))
-    effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
+    effects = [
+        (c, [_Span(form.columns) for form in c.forms if form.keep.sum() == c.forms[0].keep.sum()])
+        for c in candidates
+        if not c.empirical
+    ]
     for place in _places(linear):
         for driver in drivers:
             if driver.joint not in (None, place.joint):
@@ -471,12 +475,6 @@ class _Span:
         """Return whether the other's columns are combinations of these."""
         left = other.columns - self.basis @ (self.basis.T @ other.columns)
         return bool(other.columns.any() and np.sum(left**2) < (1 - _SAME) * np.sum(other.columns**2))
-
-
-def _whole_forms(candidate: Candidate) -> list[_Span]:
-    """Return the forms of an effect with all its parameters."""
-    forms = candidate.forms
-    return [_Span(form.columns) for form in forms if form.keep.sum() == forms[0].keep.sum()]
 
 
 def _says(

@@ -80,8 +80,6 @@ CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
 ALIAS_CORRELATION, LISTED_ALIAS_CORRELATION = 0.9, 0.7
 # λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
 SEPARATION_LAMBDA = 5.4
-# A view that adds less than this share of λ separates nothing: it would have to be repeated a thousand times.
-WORTHWHILE_GAIN = 1e-3
 # p-value below which what is left is said to follow a covariate (custom), and bins that show the shape.
 CLEAR_DEPENDENCE, DEPENDENCE_BINS = 0.01, 5
 

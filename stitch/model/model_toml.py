@@ -5,6 +5,8 @@ what happened at one view of a session; `keep_arm_effects` takes nothing but the
 joints and links as they are, under another mount, tool or day.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -143,18 +145,23 @@ def read_model(path: Path | str) -> ModelFile:
     )
 
 
-def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
+@contextmanager
+def _tables(path: Path, name: str, form: str) -> Iterator[None]:
+    """Refuse tables of another form, for which this is left by an error."""
     try:
+        yield
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(f"{path}: {name} must be tables such as {form}") from None
+
+
+def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
+    with _tables(path, "axes", "[axes.table] with direction, point; to fix: three numbers each"):
         axes = {
             str(name): (np.array(t["direction"], float), np.array(t["point"], float) if "point" in t else None)
             for name, t in tables.items()
         }
         if any(v is not None and (v.shape != (3,) or not np.isfinite(v).all()) for pair in axes.values() for v in pair):
             raise ValueError
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{path}: axes must be tables such as [axes.table] with direction, point; to fix: three numbers each"
-        ) from None
     return axes
 
 
@@ -178,22 +185,18 @@ def with_model_axes(session: SessionData, file: ModelFile) -> SessionData:
 
 
 def _targets(path: Path, table: Any) -> dict[str, Target]:
-    out = {}
-    try:
+    targets = {}
+    with _tables(path, "targets", "[targets.ball1] with position, sigma; to fix: three numbers each"):
         for name, t in table.items():
             orientation = np.array(t["orientation"], float) if "orientation" in t else None
-            out[str(name)] = Target(np.array(t["position"], float), np.array(t["sigma"], float), orientation)
-            if out[name].position.shape != (3,) or (orientation is not None and orientation.shape != (3, 3)):
+            targets[str(name)] = Target(np.array(t["position"], float), np.array(t["sigma"], float), orientation)
+            if targets[name].position.shape != (3,) or (orientation is not None and orientation.shape != (3, 3)):
                 raise ValueError
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{path}: targets must be tables such as [targets.ball1] with position, sigma; to fix: three numbers each"
-        ) from None
-    return out
+    return targets
 
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
-    try:
+    with _tables(path, "effects", "[effects.joint_compliance.c2]; to fix: value, sigma, unit in each"):
         return {
             str(name): {
                 str(p): Parameter(
@@ -207,10 +210,6 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
             }
             for name, parameters in table.items()
         }
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{path}: effects must be tables such as [effects.joint_compliance.c2]; to fix: value, sigma, unit in each"
-        ) from None
 
 
 def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:

@@ -22,7 +22,6 @@ from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES
 
 KINDS = ("rotary", "linear")
-CARRIES = ("part", "robot", "scanner")
 
 
 @dataclass(frozen=True)
