@@ -128,6 +128,7 @@ class LedgerStep:
     T_mount: Array  # (4, 4)
     values: dict[str, dict[str, float]] = field(default_factory=dict)  # effect -> parameter -> value
     notes: tuple[Note, ...] = ()
+    predicted: float = float("nan")  # heldout_rms, by the diagnosis that named what was added
 
 
 @dataclass(frozen=True, eq=False)

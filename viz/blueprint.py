@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 from stitch.numerics.frames import Array
 from viz.colours import UNSEEN, unsigned_colours
 from viz.course_recording import WHERE, X_RANGE, Y_RANGE
-from viz.model_timeline import FRAMES, ModelScene, shown_steps
+from viz.model_timeline import ModelScene, shown_steps
 from viz.part_surface import Camera
 
 # A colour bar as a native picture of a recording.
@@ -65,11 +65,14 @@ _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
 
-def model_blueprint(scene: ModelScene, camera: Camera, raw: Array) -> rrb.Blueprint:
+def model_blueprint(scene: ModelScene, camera: Camera, raw: Array, moments: int) -> rrb.Blueprint:
     """Before and after, and why | the model step by step | every iteration | what is missing | the cell.
+
+    It plays from the coarse hand-eye on: where it stands, something shows.
 
     Args:
         raw: (N, 3) places that the raw scans take, reference frame.
+        moments: their number.
     """
     before, after = shown_steps(scene.history)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
@@ -90,7 +93,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, raw: Array) -> rrb.Bluepr
         rrb.Spatial3DView(
             origin="/",
             contents=["stitched", "scans/**", "displacements"],
-            name=f"Views farthest off, displaced {scene.magnified[1]:g} times as far (coarse: {scene.magnified[0]:g})",
+            name=f"Views farthest off, displaced {scene.fitted:g} times as far (coarse: {scene.coarse:g})",
             eye_controls=_eye(scene, camera),
             background=_GROUND,
             line_grid=False,
@@ -104,9 +107,24 @@ def model_blueprint(scene: ModelScene, camera: Camera, raw: Array) -> rrb.Bluepr
         column_shares=[3, 3, 2],
         name="The model, step by step",
     )
-    time = rrb.TimePanel(state="collapsed", timeline="model", play_state="paused", fps=FRAMES)
+    time = rrb.TimePanel(
+        state="collapsed",
+        timeline="iteration",
+        play_state="playing",
+        fps=1.0,
+        loop_mode="selection",
+        time_selection=rrb.components.AbsoluteTimeRange(min=1, max=moments - 1),
+    )
+    far = f"{scene.fitted:g} times as far from the stitched part (coarse: {scene.coarse:g})"
     everything = eye_for(np.concatenate([scene.surface.vertices, raw]), camera.axes, camera.up, _OF_CLOUDS)
-    tabs = rrb.Tabs(compare, steps, _moments(everything), _diagnosis(), _cell(scene.cell), active_tab=0)
+    tabs = rrb.Tabs(
+        compare,
+        steps,
+        _moments(everything, f"Every scan, {far}; timeline view: as they come"),
+        _diagnosis(),
+        _cell(scene.cell),
+        active_tab=0,
+    )
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
@@ -126,16 +144,22 @@ def target_blueprint(cell: Array) -> rrb.Blueprint:
     )
     result = rrb.Vertical(targets, _why(), row_shares=[5, 2], name="Targets")
     time = rrb.TimePanel(state="collapsed", timeline="iteration", play_state="paused", fps=1.0)
-    tabs = rrb.Tabs(result, _moments(None), _diagnosis(), _cell(cell), active_tab=0)
+    tabs = rrb.Tabs(
+        result,
+        _moments(None, "Every target where the run had it (timeline iteration), and as views come (timeline view)"),
+        _diagnosis(),
+        _cell(cell),
+        active_tab=0,
+    )
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
-def _moments(eye: rrb.EyeControls3D | None) -> rrb.Horizontal:
+def _moments(eye: rrb.EyeControls3D | None, name: str) -> rrb.Horizontal:
     """The scans as every iteration has them | what is said of it, and the rms of all."""
     clouds = rrb.Spatial3DView(
         origin="/",
         contents=["views/**", "fused"],
-        name="Every scan where the run had it (timeline iteration), and as they come (timeline view)",
+        name=name,
         eye_controls=eye,
         background=_GROUND,
         line_grid=False,

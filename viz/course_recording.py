@@ -16,6 +16,7 @@ _LEFT, _BELOW, _ABOVE = 12.0, 5.0, 3.0
 # Letters that stand side by side along the drawing; what is longer would cover what is beside it.
 _LETTERS = 110
 _DOTS, _LINE, _WHISKER, _AXIS = (232, 235, 239), (230, 159, 0), (150, 155, 160), (110, 115, 120)
+_GRID = (52, 57, 63)
 WHERE = "diagnosis/why"
 X_RANGE, Y_RANGE = (-2.0, _LEFT + _WIDE + 3.0), (-_ABOVE - 2.0, _HIGH + _BELOW + 1.0)
 
@@ -35,7 +36,9 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     at = np.array(course["at"])
     values = ("measured", "sigma", "predicted", "predicted_sigma")
     measured, sigma, predicted, band = (np.array(course[key]) * factor for key in values)
-    to_x, to_y = _scales(at, measured, sigma, predicted)
+    low = min(float((measured - 2 * sigma).min()), float(predicted.min()), 0.0)
+    high = max(float((measured + 2 * sigma).max()), float(predicted.max()), 0.0)
+    to_x, to_y = _scales(at, low, high)
     x = to_x(at)
     order = np.argsort(x, kind="stable")
     lines = [np.column_stack([x, to_y(predicted + s * 2 * band)])[order] for s in (0, -1, 1)]
@@ -55,19 +58,19 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     _label(
         recording, "title", [(_LEFT + _WIDE / 2, -_ABOVE)], [f"how far {course['of']} is off ({unit}), over {along}"]
     )
-    heights = np.array([measured.max(), 0.0]) if measured.max() > -measured.min() else np.array([0.0, measured.min()])
-    _label(
-        recording, "heights", np.column_stack([np.full(2, _LEFT / 2), to_y(heights)]), [f"{h:+.3g}" for h in heights]
-    )
+    heights = round_marks(low, high, 4)
+    texts = [f"{h:+.3g}" if h else "0" for h in heights]
+    _label(recording, "heights", np.column_stack([np.full(len(heights), _LEFT / 2), to_y(heights)]), texts)
     in_order = course["follows"] == "view order" and course["views"]
-    told = [names[v] for v in course["views"]] if in_order else [f"{float(f'{value:.3g}'):g}" for value in at]
-    some = apart(x, (max(map(len, told)) + 2) * _WIDE / _LETTERS)
-    _label(
-        recording,
-        "names",
-        np.column_stack([x[some], np.full(len(some), _HIGH + _BELOW / 2)]),
-        [told[i] for i in some],
-    )
+    marks = at if in_order else round_marks(float(at.min()), float(at.max()), 8)
+    told = [names[v] for v in course["views"]] if in_order else [f"{mark:.6g}" for mark in marks]
+    some = apart(to_x(marks), (max(map(len, told), default=0) + 2) * _WIDE / _LETTERS)
+    below = np.column_stack([to_x(marks[some]), np.full(len(some), _HIGH + _BELOW / 2)])
+    _label(recording, "names", below, [told[i] for i in some])
+    grid = [[[_LEFT, float(y)], [_LEFT + _WIDE, float(y)]] for y in to_y(heights)]
+    grid += [[[float(x), 0.0], [float(x), _HIGH]] for x in to_x(marks[some])]
+    drawn = rr.LineStrips2D(grid, colors=[_GRID], radii=rr.Radius.ui_points(0.4))
+    recording.log(f"{WHERE}/grid", drawn, static=True)
     if len(course["views"]) == len(names):
         colours = signed_colours(measured, float(np.abs(measured).max()))
         recording.log("robot/flanges", rr.Points3D.from_fields(colors=colours), static=True)
@@ -83,13 +86,19 @@ def apart(x: Array, least: float) -> list[int]:
     return kept
 
 
+def round_marks(low: float, high: float, most: int) -> Array:
+    """Return at most so many round numbers from low to high at equal steps: 1, 2 or 5 with zeros."""
+    least = max(high - low, 1e-12) / most
+    power = 10.0 ** np.floor(np.log10(least))
+    step = next(x * power for x in (1, 2, 5, 10) if x * power >= least * (1 - 1e-9))
+    return step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 0.5) + 0.0
+
+
 _Scale = Callable[[Array], Array]
 
 
-def _scales(at: Array, measured: Array, sigma: Array, predicted: Array) -> tuple[_Scale, _Scale]:
-    """Return how numbers become places along the drawing, and how values become heights."""
-    low = min(float((measured - 2 * sigma).min()), float(predicted.min()), 0.0)
-    high = max(float((measured + 2 * sigma).max()), float(predicted.max()), 0.0)
+def _scales(at: Array, low: float, high: float) -> tuple[_Scale, _Scale]:
+    """Return how numbers become places along the drawing, and how values from low to high become heights."""
     size = (high - low) or 1.0
 
     def to_x(places: Array) -> Array:

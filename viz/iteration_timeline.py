@@ -1,14 +1,18 @@
 """The timelines `iteration` and `view` of a recording: every scan once, moved by every stage and every iteration.
 
-`iteration` begins with the raw scans, then coarse, the models before the present one, each iteration of correct, fit
-and register, and what was fused. `view` has the stitched scans as they come, one after another.
+`iteration` is the one of the run: the raw scans, coarse, each iteration of every model so far, register, and what was
+fused. Motions are magnified from where register puts the views. `view` has the stitched scans as they come, one after
+another. A recording keeps its moments, so that one that takes its place has those of the models before.
 """
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
+from rerun.chunk import RrdReader
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -19,7 +23,7 @@ from stitch.session.scan import even_indices
 from stitch.session.session import SessionData
 from stitch.system.threads import take_mapped
 from viz.colours import UNSEEN, robust_limit, unsigned_colours, view_colours
-from viz.model_timeline import FRAMES
+from viz.model_timeline import ModelScene, Shown, displaced, factor_of
 from viz.page_parts import unbroken
 from viz.rrd_file import words
 from viz.run_numbers import shown_points
@@ -30,6 +34,7 @@ _OF_EYE = 50
 _OF_VIEW, _OF_ALL, _OF_FUSED, _VIEWS = 10_000, 400_000, 40_000, 400
 _CLOUD, _TARGETS = rr.Radius.ui_points(1.3), rr.Radius.ui_points(4.0)
 RAW, FUSE, MODEL = "raw", "fuse", "model"
+_KEPT = "kept"
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,14 @@ class Moments:
         names = tuple(self.sessions[-1].names)
         self.found.append(Moment(stage, title, names, np.array(poses), rms, gate, told))
 
-    def with_models(self, run: RunData, history: ModelHistory | None) -> tuple[Moment, ...]:
-        """Return all moments: the raw scans first, models of the history where they belong."""
+    def with_models(
+        self, run: RunData, history: ModelHistory | None, kept: Sequence[Moment] = ()
+    ) -> tuple[Moment, ...]:
+        """Return all moments: the raw scans first, those of the models before the present one, and their ends.
+
+        Args:
+            kept: of the recording whose place this one takes, where it shows the same views.
+        """
         if not self.found:
             return ()
         first, *rest = self.found
@@ -96,31 +107,75 @@ class Moments:
         ends = {moment.stage: i for i, moment in enumerate(rest) if moment.stage in last}
         for stage, i in ends.items():
             rest[i] = replace(rest[i], step=last[stage])
-        before = [
-            Moment(MODEL, f"model: {step.name}", tuple(run.session.names), step.poses, step=k)
+        names = tuple(run.session.names)
+        before = [moment for moment in kept if moment.names == names and moment.stage not in (RAW, COARSE)]
+        before = [moment for moment in before if moment.step is None or 0 < moment.step < last["correct"]]
+        reached = {moment.step for moment in before}
+        before += [
+            Moment(MODEL, f"model: {step.name}", names, step.poses, step=k)
             for k, step in enumerate(history.steps[1:-2], start=1)
+            if k not in reached
         ]
+        if before:
+            added = history.steps[-2].name
+            rest = [replace(moment, title=f"{added}: {moment.title}") if _is_fit(moment) else moment for moment in rest]
         return (raw, replace(first, step=0), *before, *rest)
 
 
-def steps_reached(moments: Sequence[Moment]) -> dict[int, int]:
-    """Return where on `iteration` the run reached each step of the model's history."""
-    return {moment.step: i for i, moment in enumerate(moments) if moment.step is not None}
+def _is_fit(moment: Moment) -> bool:
+    return moment.stage not in (REGISTER, FUSE)
 
 
-def log_moments(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment], whole: SessionData) -> Array:
+def keep_moments(rec: rr.RecordingStream, moments: Sequence[Moment]) -> None:
+    """Let a recording keep what the next model's recording shows of this one: all but register and what follows it."""
+    told = [asdict(moment) | {"poses": moment.poses.tolist()} for moment in moments if _is_fit(moment)]
+    rec.log(_KEPT, rr.TextDocument(json.dumps(told)), static=True)
+
+
+def kept_moments(path: Path) -> list[Moment]:
+    """Return the moments that a recording keeps; none where there is none, or it is of another version."""
+    if not path.is_file():
+        return []
+    try:
+        for chunk in RrdReader(str(path)).stream():
+            if chunk.entity_path == f"/{_KEPT}":
+                (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[0]
+                rows = json.loads(text)
+                return [Moment(**row | {"names": tuple(row["names"]), "poses": np.array(row["poses"])}) for row in rows]
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError):
+        return []
+    return []
+
+
+def shown_moments(moments: Sequence[Moment], scene: ModelScene) -> list[Shown]:
+    """Return the moments that have all views of the scene as the model's pictures show them; raw scans as coarse."""
+    shown = []
+    for at, moment in enumerate(moments):
+        if moment.names != scene.names or moment.stage == FUSE:
+            continue
+        raw = moment.stage == RAW
+        poses, step = (moments[at + 1].poses, 0) if raw else (moment.poses, moment.step)
+        shown.append(Shown(at, moment.title, poses, factor_of(scene, poses), step))
+    return shown
+
+
+def log_moments(
+    rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment], whole: SessionData, scene: ModelScene | None
+) -> Array:
     """Log clouds, their motions, and what is said of them, and return places (N, 3) that the raw scans take.
 
     Args:
         whole: the session with the views that were left out.
+        scene: by which motions are magnified; None: they are shown as they are.
     """
     if not moments:
         return np.zeros((0, 3))
     shown = [whole.names[v] for v in even_indices(len(whole.names), _VIEWS)]
+    magnified = [moment.poses if scene is None else _magnified(moment, scene) for moment in moments]
     each = min(_OF_VIEW, _OF_ALL // len(shown))
     _log_clouds(rec, run, whole, shown, each)
     for name in shown:
-        _log_motion(rec, name, moments)
+        _log_motion(rec, name, moments, magnified)
     fused = [i for i, moment in enumerate(moments) if moment.stage == FUSE]
     if fused:
         _log_fused(rec, run, shown, fused[-1])
@@ -142,7 +197,6 @@ def _log_clouds(rec: rr.RecordingStream, run: RunData, whole: SessionData, shown
         points = points[even_indices(len(points), each)].astype(np.float32)
         rec.set_time("iteration", sequence=0)
         if name in colours:
-            rec.set_time("model", sequence=0)
             rec.set_time("view", sequence=run.session.names.index(name))
         rec.log(["views", name], rr.Points3D(points, colors=[colours.get(name, UNSEEN)], radii=radius))
         rec.reset_time()
@@ -151,18 +205,21 @@ def _log_clouds(rec: rr.RecordingStream, run: RunData, whole: SessionData, shown
             rec.send_columns(_path(name), [rr.TimeColumn("view", sequence=[v])], _transforms(pose[None]))
 
 
-def _log_motion(rec: rr.RecordingStream, name: str, moments: Sequence[Moment]) -> None:
-    """Where every moment has a view; nothing from where it was left out."""
-    here = [(i, m, m.poses[m.names.index(name)]) for i, m in enumerate(moments) if name in m.names]
-    poses = np.array([pose for _, _, pose in here])
-    rec.send_columns(_path(name), [rr.TimeColumn("iteration", sequence=[i for i, _, _ in here])], _transforms(poses))
-    steps = [(m.step, pose) for _, m, pose in here if m.step is not None]
-    if name in moments[-1].names and steps:
-        at = [FRAMES * step for step, _ in steps]
-        poses = np.array([pose for _, pose in steps])
-        rec.send_columns(_path(name), [rr.TimeColumn("model", sequence=at)], _transforms(poses))
-    if here[-1][0] < len(moments) - 1:
-        _clear(rec, name, here[-1][0] + 1)
+def _magnified(moment: Moment, scene: ModelScene) -> Array:
+    """Return (V, 4, 4) where a moment's views are shown: their motion magnified."""
+    if moment.names != scene.names or moment.stage == RAW:
+        return moment.poses
+    T = displaced(scene, moment.poses, factor_of(scene, moment.poses))
+    return np.asarray(frames.make(np.eye(3), scene.centre) @ T @ scene.at_rest)
+
+
+def _log_motion(rec: rr.RecordingStream, name: str, moments: Sequence[Moment], magnified: Sequence[Array]) -> None:
+    """Where every moment shows a view; nothing from where it was left out."""
+    here = [i for i, moment in enumerate(moments) if name in moment.names]
+    poses = np.array([magnified[i][moments[i].names.index(name)] for i in here])
+    rec.send_columns(_path(name), [rr.TimeColumn("iteration", sequence=here)], _transforms(poses))
+    if here[-1] < len(moments) - 1:
+        _clear(rec, name, here[-1] + 1)
 
 
 def _log_fused(rec: rr.RecordingStream, run: RunData, shown: Sequence[str], at: int) -> None:
@@ -212,8 +269,6 @@ def _log_words(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment],
     unit = run.session.length_unit
     for i, moment in enumerate(moments):
         rec.set_time("iteration", sequence=i)
-        if moment.step is not None:
-            rec.set_time("model", sequence=FRAMES * moment.step)
         lines = [f"## {moment.title}", f"Moment {i} of {len(moments) - 1} on the timeline `iteration`.", ""]
         if np.isfinite(moment.rms):
             lines += [f"Distance between views: {length_text(moment.rms, unit, 4)} rms.", ""]

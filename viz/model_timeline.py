@@ -1,17 +1,21 @@
-"""The timeline `model` of a recording: the part fades, the scans move and the bars fall from step to step of the model.
+"""What the model does at every moment of a recording: the part fades, the scans move and the bars fall.
 
-Step k stands at 10·k; between two steps colours and places run over evenly.
+Where a moment is a step of the model's history, its field is that of the history; else it is computed from where the
+moment has the views.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 
+from stitch.model.forward import true_geometry
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
+from stitch.observations.surfaces.matching import signed_distances
 from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.model_history import ModelHistory, ModelStep
 from stitch.run_data import RunData
@@ -22,12 +26,12 @@ from viz.part_surface import PartSurface
 from viz.rrd_file import words
 from viz.run_numbers import shown_points
 
-# What the timeline `model` of a recording shows: the part, where every step puts the views, and what is magnified.
-
 # Views whose scans are shown displaced: those farthest off under the first model.
 _FEW = 4
 # The largest displacement is shown as this share of the part's size.
 _SHOWN_SHARE = 0.08
+# What would be shown farther off than this share is an earlier stage, to be magnified less.
+_FARTHEST = 0.5
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,9 @@ class ModelScene:
     um: float
     limit: float  # full colour of the field
     centre: Array  # (3,) of the part
-    twists: Array  # (S, V, 6) about the centre: from where register puts a view to where the step puts it
-    magnified: Array  # (S,)
+    at_rest: Array  # (V, 4, 4) about the centre, where register puts the views
+    coarse: float  # how many times farther than they are views are displaced at the coarse hand-eye
+    fitted: float  # and afterwards
     farthest: tuple[int, ...]  # views that are off most under the first model
     cell: Array  # (N, 3) some points of the cell, base frame
 
@@ -51,19 +56,16 @@ class ModelScene:
 
 
 def model_scene(run: RunData, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:
-    """Return the poses of the views at every step, and the magnification that makes them visible."""
+    """Return what all moments share, and the magnification that makes the motions of the views visible."""
     centre = surface.vertices.mean(axis=0)
-    to_centre = frames.make(np.eye(3), -centre)
-    at_rest = frames.inverse(to_centre @ history.steps[-1].poses)
-    twists = np.array([frames.log(to_centre @ s.poses @ at_rest) for s in history.steps])
-    # A motion that all views share moves the part, and nothing against anything.
-    twists -= twists.mean(axis=1, keepdims=True)
+    at_rest = frames.make(np.eye(3), -centre) @ history.steps[-1].poses
     size = float(np.ptp(surface.vertices, axis=0).max())
-    far = np.linalg.norm(twists[..., 3:], axis=2) + 0.3 * size * np.linalg.norm(twists[..., :3], axis=2)
+    far = []
+    for step in history.steps[:-1]:
+        twists = _twists(step.poses, at_rest, centre)
+        moved = np.linalg.norm(twists[:, 3:], axis=1) + 0.3 * size * np.linalg.norm(twists[:, :3], axis=1)
+        far.append(size * _SHOWN_SHARE / max(float(moved.max()), 1e-12))
     first = history.models[0].field
-    models = np.array([size * _SHOWN_SHARE / max(x, 1e-12) for x in far.max(axis=1)])
-    # One factor for all that is fitted, its own for the coarse step, which is so much farther off.
-    factors = np.array([_round(models[0]), *[_round(models[1:-1].min())] * (len(models) - 1)])
     return ModelScene(
         history=history,
         surface=surface,
@@ -71,11 +73,44 @@ def model_scene(run: RunData, history: ModelHistory, surface: PartSurface, cell:
         um=MICROMETRES[run.session.length_unit],
         limit=full_colour_distance(first, run.session),
         centre=centre,
-        twists=twists,
-        magnified=factors,
+        at_rest=at_rest,
+        # One factor for all that is fitted, its own for the coarse step, which is so much farther off.
+        coarse=_round(far[0]),
+        fitted=_round(min(far[1:])),
         farthest=tuple(int(v) for v in np.argsort(-mean_sizes(first.values), kind="stable")[:_FEW]),
         cell=cell,
     )
+
+
+def factor_of(scene: ModelScene, poses: Array) -> float:
+    """Return how many times farther than it is the motion of views at poses (V, 4, 4) is shown: less where they are as
+    far off as at the coarse hand-eye."""
+    moved = displaced(scene, poses, scene.fitted)[:, :3, 3]
+    size = float(np.ptp(scene.surface.vertices, axis=0).max())
+    return scene.fitted if np.linalg.norm(moved, axis=1).max() < _FARTHEST * size else scene.coarse
+
+
+def displaced(scene: ModelScene, poses: Array, factor: float) -> Array:
+    """Return (V, 4, 4) by which views that register has put in place move where poses (V, 4, 4) put them, so many times
+    as far; about the part's centre, less what all views share."""
+    return frames.exp(factor * _twists(poses, scene.at_rest, scene.centre))
+
+
+def _twists(poses: Array, at_rest: Array, centre: Array) -> Array:
+    """Return (V, 6) from where register puts the views to poses (V, 4, 4), about a centre."""
+    twists = frames.log(frames.make(np.eye(3), -centre) @ poses @ frames.inverse(at_rest))
+    # A motion that all views share moves the part, and nothing against anything.
+    return twists - twists.mean(axis=0, keepdims=True)
+
+
+class Shown(NamedTuple):
+    """One moment as the model's pictures have it."""
+
+    at: int  # on the timeline
+    title: str
+    poses: Array  # (V, 4, 4) T_reference_scanner
+    factor: float  # by which motions are magnified
+    step: int | None  # of the history
 
 
 def shown_steps(history: ModelHistory) -> tuple[ModelStep, ModelStep]:
@@ -96,8 +131,6 @@ def _round(factor: float) -> float:
     return float(max(x * power for x in (1, 2, 5) if x * power <= factor * (1 + 1e-9)))
 
 
-FRAMES = 10  # of the timeline from one step to the next
-_BETWEEN = 2  # frames between two that are kept
 # What a screen can show; the run folder keeps everything.
 _POINTS, _STILL = 5_000, 15_000
 _THICK = rr.Radius.ui_points(3.0)
@@ -107,13 +140,12 @@ _NAMED = 0.02
 
 
 def log_model(
-    recording: rr.RecordingStream, run: RunData, scene: ModelScene, up: Array, reached: dict[int, int]
+    recording: rr.RecordingStream, run: RunData, scene: ModelScene, up: Array, shown: Sequence[Shown]
 ) -> None:
-    """Everything that stands still, and all frames of the timeline.
+    """Everything that stands still, and what every moment shows.
 
     Args:
         up: (3,) of the picture, reference frame.
-        reached: by step, where the timeline `iteration` has it.
     """
     for name in ("now", "before", "after"):
         _log_part(recording, f"part/{name}", scene)
@@ -125,16 +157,14 @@ def log_model(
     at_rest = [frames.transform(run.poses[v], shown_points(run.session.views[v])) for v in scene.farthest]
     for v, own, colour in zip(scene.farthest, at_rest, COLOURS_OF_FEW, strict=False):
         points = own[np.linspace(0, len(own) - 1, min(len(own), _POINTS)).astype(int)] - scene.centre
-        shown = rr.Points3D(points.astype(np.float32), colors=[colour])
-        recording.log(["scans", scene.names[v]], shown, static=True)
+        scan = rr.Points3D(points.astype(np.float32), colors=[colour])
+        recording.log(["scans", scene.names[v]], scan, static=True)
     places = one_above_the_other(at_rest, up)
     first = mean_sizes(scene.history.models[0].field.values) * scene.um
     recording.log("bars/first", rr.BarChart(first, color=GREY), static=True)
-    for frame in range(0, FRAMES * (len(scene.history.steps) - 1) + 1, _BETWEEN):
-        recording.set_time("model", sequence=frame)
-        if frame % FRAMES == 0 and frame // FRAMES in reached:
-            recording.set_time("iteration", sequence=reached[frame // FRAMES])
-        _log_frame(recording, scene, frame / FRAMES, places)
+    for moment in shown:
+        recording.set_time("iteration", sequence=moment.at)
+        _log_moment(recording, run, scene, moment, places)
         recording.reset_time()
 
 
@@ -149,14 +179,16 @@ def one_above_the_other(views: Sequence[Array], up: Array) -> Array:
     return places
 
 
-def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, places: Array) -> None:
-    """A moment between two steps: their values in proportion; `places` (F, 3) carry the names of the farthest."""
-    steps, k = scene.history.steps, min(int(at), len(scene.history.steps) - 2)
-    share = at - k
-    one, other = steps[k].field, steps[k + 1].field
-    recording.log("part/now", _colours(scene, (1 - share) * one.overall + share * other.overall))
-    moved = (1 - share) * scene.magnified[k] * scene.twists[k] + share * scene.magnified[k + 1] * scene.twists[k + 1]
-    T = frames.exp(moved)
+def _log_moment(recording: rr.RecordingStream, run: RunData, scene: ModelScene, moment: Shown, places: Array) -> None:
+    """Log one moment; `places` (F, 3) carry the names of the farthest."""
+    assert run.registered is not None
+    field = None if moment.step is None else scene.history.steps[moment.step].field
+    if field is None:
+        # Effects of the scanner move points by micrometres: those of the present model.
+        points = true_geometry(run.measurement, run.model)[1]
+        field = scene.history.patches.field(signed_distances(run.registered.matches, moment.poses, points))
+    recording.log("part/now", _colours(scene, field.overall))
+    T = displaced(scene, moment.poses, moment.factor)
     for v in scene.farthest:
         placed = rr.Transform3D(translation=T[v, :3, 3] + scene.centre, mat3x3=T[v, :3, :3])
         recording.log(["scans", scene.names[v]], placed)
@@ -172,22 +204,18 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
         show_labels=True,
     )
     recording.log("displacements", arrows)
-    means = mean_sizes((1 - share) * one.values + share * other.values) * scene.um
-    recording.log("bars/views", rr.BarChart(means, color=_BAR))
-    recording.log("now", words(_told(scene, k, share)))
+    recording.log("bars/views", rr.BarChart(mean_sizes(field.values) * scene.um, color=_BAR))
+    recording.log("now", words(_told(scene, moment, field.mean_abs)))
 
 
-def _told(scene: ModelScene, k: int, share: float) -> str:
-    """Describe the picture at a step, or on the way from step k to the next."""
-    steps = scene.history.steps
-    if 0 < share < 1:
-        told = "Nothing is fitted in between: colours, places and bars are drawn in proportion."
-        return f"## {steps[k].name} → {steps[k + 1].name}\n{100 * share:.0f} % of the way. {told}"
-    now = k + round(share)
+def _told(scene: ModelScene, moment: Shown, mean: float) -> str:
+    """Describe the picture at a moment."""
     first = scene.history.models[0].name
+    off = length_text(mean * scene.um / 1e3, "mm")
     shown = f"Bars: the views in their order, from 0; behind them in grey those of {first}, darker where a view is "
     shown += "farther off than there."
-    return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}.\n\n{shown}"
+    times = f"Scans are displaced {moment.factor:g} times as far." if moment.factor > 1 else ""
+    return f"## {moment.title}\nviews disagree by {off} on average. {times}\n\n{shown}"
 
 
 def _log_part(recording: rr.RecordingStream, path: str, scene: ModelScene) -> None:

@@ -1,7 +1,7 @@
 """Pack the data of the part's viewer: the surface once, the field of every step of the model's history."""
 
 import base64
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,13 @@ from viz.part_surface import Camera, PartSurface
 
 # Arrays as text for a browser, small.
 
-_UNKNOWN = -32768
 
-
-def packed_values(values: Array) -> dict[str, Any]:
-    """16 bits a value and the size of one count; what nobody knows is the smallest number."""
-    known = np.isfinite(values)
-    count = float(np.abs(values[known]).max(initial=0.0)) / 32000 or 1.0
-    return {"count": count, "data": packed(np.where(known, np.nan_to_num(values) / count, _UNKNOWN).astype("<i2"))}
+def packed_values(values: Array, bits: Literal[8, 16] = 16) -> dict[str, Any]:
+    """So many bits a value and the size of one count; what nobody knows is the smallest number."""
+    known, least = np.isfinite(values), -(2 ** (bits - 1))
+    count = float(np.abs(values[known]).max(initial=0.0)) / (-least - 1) or 1.0
+    counts = np.where(known, np.round(np.nan_to_num(values) / count), least).astype(f"<i{bits // 8}")
+    return {"count": count, "bits": bits, "data": packed(counts)}
 
 
 def packed_floats(numbers: Array) -> str:
@@ -94,7 +93,8 @@ def part_data(
                 "name": names[v],
                 "index": v,
                 "means": [_mean_abs(x[v]) for x in own],
-                "steps": [packed_values(x[v]) for x in own],
+                # For colours, of which there are fewer.
+                "steps": [packed_values(x[v], 8) for x in own],
             }
             for v in sorted(int(v) for v in worst)
         ],

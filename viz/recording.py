@@ -16,7 +16,7 @@ from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
 from viz.diagnosis_recording import NOT_YET
-from viz.iteration_timeline import Moments, log_moments, steps_reached
+from viz.iteration_timeline import Moments, keep_moments, kept_moments, log_moments, shown_moments
 from viz.model_timeline import log_model, model_scene
 from viz.part_surface import camera_for, part_surface
 from viz.robot_scene import log_robot
@@ -56,7 +56,10 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
 class RerunRecorder:
-    """A `stitch.recorder.Recorder` that writes one .rrd file when the run has ended."""
+    """A `stitch.recorder.Recorder` that writes one .rrd file when the run has ended.
+
+    One that lies there is of the models before, and its iterations are shown too.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -84,19 +87,22 @@ class RerunRecorder:
             rec.log(place, words(NOT_YET), static=True)
         log_no_course(rec, NOT_YET)
         cell = log_robot(rec, run)
-        moments = self._moments.with_models(run, history)
-        raw = log_moments(rec, run, moments, self._moments.whole or run.session)
+        moments = self._moments.with_models(run, history, kept_moments(self.path))
+        keep_moments(rec, moments)
+        whole = self._moments.whole or run.session
         if history is None:
+            log_moments(rec, run, moments, whole, None)
             _log_targets(rec, run)
             rec.send_blueprint(target_blueprint(cell))
         else:
             surface = part_surface(run.fused, history.patches)
             camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
             scene = model_scene(run, history, surface, cell)
-            log_model(rec, run, scene, camera.up, steps_reached(moments))
+            raw = log_moments(rec, run, moments, whole, scene)
+            log_model(rec, run, scene, camera.up, shown_moments(moments, scene))
             full = scene.limit * um
             log_colour_bar(rec, "colours/field", ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only")
-            rec.send_blueprint(model_blueprint(scene, camera, raw))
+            rec.send_blueprint(model_blueprint(scene, camera, raw, len(moments)))
         file.write()
 
 

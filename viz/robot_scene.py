@@ -58,8 +58,10 @@ def _read(own: LinkMesh) -> "trimesh.Trimesh | None":
 
 
 # Of lines, in pixels.
-_THIN, _THICK, _DOT = rr.Radius.ui_points(1.0), rr.Radius.ui_points(3.0), rr.Radius.ui_points(6.0)
-_GREY, _PART, _SCANNER = (110, 110, 110), (190, 195, 200), (230, 159, 0)
+_THIN, _DOT = rr.Radius.ui_points(1.0), rr.Radius.ui_points(6.0)
+_GREY, _PART, _SCANNER, _TUBES = (110, 110, 110), (190, 195, 200), (230, 159, 0), (150, 156, 164)
+# Radius of a link as a share of the arm's length.
+_TUBE = 0.012
 _SEEN = 0.98  # share of the points that lie within the drawn field of the scanner
 _POINTS = 20_000
 # Views at which the arm is shown alone.
@@ -89,9 +91,10 @@ def log_robot(recording: rr.RecordingStream, run: RunData) -> Array:
         shown, label = (_SCANNER if v == 0 else colour, name) if in_hand else (_SCANNER, "scanner")
         recording.log(f"robot/scanner/{label}", rr.LineStrips3D(lines, colors=[shown], radii=_THIN), static=True)
     points = take_mapped(run.fused.points, even_indices(len(run.fused.points), _POINTS))
-    if not in_hand:
-        points = frames.transform(flange[0], points)
     recording.log("robot/part", rr.Points3D(points.astype(np.float32), colors=[_PART]), static=True)
+    if not in_hand:
+        _log_carried(recording, flange)
+        points = frames.transform(flange[0], points)
     first = "" if in_hand else f" at {names[0]}"
     _log_names(
         recording,
@@ -116,12 +119,40 @@ def _log_names(recording: rr.RecordingStream, places: dict[str, Array]) -> None:
     recording.log("robot/names", named, static=True)
 
 
+def _log_carried(recording: rr.RecordingStream, flange: Array) -> None:
+    """Let the part follow the flanges (V, 4, 4) on the timeline `view`; elsewhere it is where the first view has it."""
+    shown = even_indices(len(flange), _VIEWS)
+    for timeline, at, T in (("view", shown, flange[shown]), ("iteration", np.zeros(1, np.int64), flange[:1])):
+        placed = rr.Transform3D.columns(
+            translation=T[:, :3, 3].astype(np.float32), mat3x3=T[:, :3, :3].astype(np.float32)
+        )
+        recording.send_columns("robot/part", [rr.TimeColumn(timeline, sequence=at)], placed)
+
+
+def _tubes(chain: Array) -> dict[str, Array]:
+    """Return the links of a chain (P, 3) as capsules: where they begin, how long, thick and turned they are."""
+    links = np.diff(chain, axis=0)
+    length = np.linalg.norm(links, axis=1)
+    links, begin, length = links[length > 0], chain[:-1][length > 0], length[length > 0]
+    way = links / length[:, None]
+    # Half way between the axis z, along which capsules lie, and the link.
+    half = way + np.array([0.0, 0.0, 1.0])
+    size = np.linalg.norm(half, axis=1, keepdims=True)
+    axis = np.where(size > 1e-6, half / np.maximum(size, 1e-12), np.array([1.0, 0.0, 0.0]))
+    turned = np.column_stack([axis, np.zeros(len(axis))])
+    thick = _TUBE * float(length.sum()) * np.ones(len(length))
+    return {"translations": begin, "lengths": length, "radii": thick, "quaternions": turned}
+
+
 def _log_reached(recording: rr.RecordingStream, arm: Array, names: list[str]) -> None:
     """Where each view has the arm (V, P, 3), or its flange alone, on the timeline `view`."""
     shown = even_indices(len(names), _VIEWS)
     at, colours = [rr.TimeColumn("view", sequence=shown)], [_SCANNER] * len(shown)
-    arms = rr.LineStrips3D.columns(strips=list(arm[shown]), colors=colours, radii=[_THICK] * len(shown))
-    recording.send_columns("robot/reached", at, arms)
+    for v in shown if arm.shape[1] > 1 else []:
+        for timeline in ("view", "iteration")[: 1 + (v == 0)]:
+            recording.set_time(timeline, sequence=int(v))
+            recording.log("robot/reached", rr.Capsules3D(**_tubes(arm[v]), colors=[_TUBES], fill_mode="solid"))
+            recording.reset_time()
     ends = rr.Points3D.columns(
         positions=arm[shown, -1],
         colors=colours,

@@ -143,7 +143,8 @@ def matrix(run: RunData) -> str:
 def ledger_rows(run: RunData) -> list[dict[str, Any]]:
     """Return a row for every model that was fitted: its name and its errors, µm."""
     um = MICROMETRES[run.session.length_unit]
-    largest = np.nanmax([step.heldout_rms for step in run.ledger]) if run.ledger else 1.0
+    # A session of too few views has nothing to leave out.
+    largest = max((step.heldout_rms for step in run.ledger if step.heldout_rms > 0), default=1.0)
     return [
         {
             "name": effect_changes(run.ledger, i),

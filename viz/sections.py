@@ -101,10 +101,23 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
     return {
         "title": titles.get(found.verdict, "What is missing?"),
         "bars": bars,
+        **_sources(screen, unit),
+        "unseen": screen["unseen"],
         "untested": screen["untested"],
         "noise": length_text(screen["noise"], unit, 2),
         "others": tried - len(screen["candidates"]),
     }
+
+
+def _sources(screen: dict[str, Any], unit: str) -> dict[str, Any]:
+    """Return the strip of what the error on views left out comes from: shares of its square, sizes, a sentence."""
+    square = sum(source["rms"] ** 2 for source in screen["sources"])
+    rows = [
+        source | {"share": source["rms"] ** 2 / square, "told": _in_um(source["rms"], unit)}
+        for source in screen["sources"]
+    ]
+    said = ", ".join(f"{row['words']} {row['told']} µm" for row in rows)
+    return {"sources": rows, "said": f"{said}." if rows else "", "total": length_text(square**0.5, unit, 2)}
 
 
 def _in_um(value: float, unit: str) -> str:

@@ -32,6 +32,11 @@ def effects_with(run: RunData, further: Sequence[str], where: object) -> list[st
     return [*run.effects, *further]
 
 
+def with_prediction(run: RunData, heldout_rms: float) -> RunData:
+    """Return the run with the error that a diagnosis predicted of the last change of its model; NaN: it did not."""
+    return replace(run, ledger=(*run.ledger[:-1], replace(run.ledger[-1], predicted=heldout_rms)))
+
+
 def effects_without(run: RunData, dropped: Sequence[str], where: object) -> list[str]:
     """Return the effects of a run's model but some, for `change`.
 
@@ -130,7 +135,9 @@ def _add_found(
         zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
         reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
         if kept and reason is None:
-            return tried, [*lines, f"Added {' and '.join(kept)}. With it:"]
+            share_then = finding.validations[kept[0]].heldout if kept == [names[0]] and validation else float("nan")
+            told = with_prediction(tried, state.heldout_or_fit_rms * share_then**0.5)
+            return told, [*lines, f"Added {' and '.join(kept)}. With it:"]
         if len(names) == 1:
             why = reason or tried.tried[names[0]]
             dropped = replace(state, tried=state.tried | tried.tried | {names[0]: why})

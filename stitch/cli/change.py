@@ -79,8 +79,10 @@ def drop(
 def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
     from stitch.api.pipeline import change
+    from stitch.api.stepwise import with_prediction
     from stitch.output import run_folder
     from stitch.output.stored_run import load_run, standing_diagnosis
+    from stitch.recorder import RunMemory
 
     if run_folder.restore_fit(run, effects, recording):
         with show_activity("reading the fit that was kept"):
@@ -89,13 +91,24 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
         run_folder.preload_entry_points("stitch.reports")
         standing = standing_diagnosis(run, state)
         with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
-            result = change(state, effects, recorder_for(scratch, recording))
+            memory = RunMemory()
+            result = change(state, effects, memory)
+            result = with_prediction(result, _predicted(standing, state, effects))
             if told := _as_good(standing, state, effects):
                 result = result.with_fit(notes=(told, *result.notes))
+            memory.tell(recorder_for(scratch, recording, run), result)
             run_folder.write_with_page(result, scratch)
     _show_changed(result, run, as_json)
     if not as_json:
         show_next(f"Next: stitch diagnose {shlex.quote(str(run))}")
+
+
+def _predicted(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> float:
+    """Return the error on views left out that a diagnosis predicts of the one effect that is added; else NaN."""
+    added = set(effects) - set(state.effects)
+    rows = [row for row in standing.get("candidates", []) if {row["effect"]} == added]
+    known = [row["heldout_rms_if_added"] for row in rows if row["heldout_rms_if_added"] is not None]
+    return known[0] if known and set(state.effects) < set(effects) else float("nan")
 
 
 def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> str:
@@ -103,7 +116,8 @@ def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -
     apart."""
     undecided = standing.get("effects", []) if standing.get("verdict") == "cannot_tell" else []
     added = [name for name in undecided if name in effects and name not in state.effects]
-    others = [name for name in undecided if name not in effects]
+    laws = [row["words"] for row in standing.get("laws", [])]
+    others = [name for name in undecided if name not in effects] + laws
     if not added or not others:
         return ""
     fit = "fits" if len(others) == 1 else "fit"
@@ -143,7 +157,7 @@ def _add_diagnosed(
             if not as_json:
                 _show_changed(result, run, as_json)
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
-                memory.tell(recorder_for(scratch, recording), result)
+                memory.tell(recorder_for(scratch, recording, run), result)
                 run_folder.write_with_page(result, scratch)
             if as_json:
                 _show_changed(result, run, as_json)

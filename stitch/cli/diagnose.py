@@ -108,8 +108,8 @@ def show_diagnosis(diagnosis: Diagnosis) -> None:
 def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], length_unit: str) -> None:
     """Print sizes and aliases of effects, the sources of the error, what was not tested, and what to measure next."""
     from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
-    from stitch.effects.contract import describe_need
     from stitch.model.model import uncertainty_scope
+    from stitch.output.finding_screen import unseen_text, untested_text
 
     if (rest := 1 - sum(c.ranked.posterior for c in diagnosis.candidates)) > _MIN_POSTERIOR_SHARE:
         say(f"Probability that no known effect is missing: {rest:.2f}.")
@@ -118,13 +118,11 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
             aliases = ", ".join(f"{name} {alike:.2f}" for name, alike in list(c.aliases.items())[:2])
             say(f"  {c.name}: {fitted_amounts(c.ranked)}{f'; aliases: {aliases}' if aliases else ''}", hang=2)
     show_budget(diagnosis.budget, length_unit)
-    if unseen := [c.name for c in diagnosis.candidates if not c.ranked.score.observable]:
-        say(f"These views cannot show: {', '.join(unseen)}.")
-    for needs in sorted(set(diagnosis.missing.values())):
-        names = [name for name, lacks in diagnosis.missing.items() if lacks == needs]
-        were, they = ("was", "it needs") if len(names) == 1 else ("were", "they need")
-        say(f"{', '.join(names)} {were} not tested: {they} {' and '.join(map(describe_need, needs))}.")
+    if untested := untested_text(diagnosis):
+        say(untested)
     if diagnosis.verdict == "adequate":
+        if unseen := unseen_text(diagnosis):
+            say(unseen)
         _show_missed(diagnosis, length_unit)
     else:
         say(uncertainty_scope(diagnosis.verdict))

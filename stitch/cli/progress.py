@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import cache
 from math import isfinite
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from stitch.system.process import AGAIN, QUIET
@@ -52,12 +53,16 @@ def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str)
         yield state
 
 
-def recorder_for(folder: Path, recording: bool) -> Recorder:
-    """Return progress on a terminal or as lines, and the recording."""
+def recorder_for(folder: Path, recording: bool, earlier: Path | None = None) -> Recorder:
+    """Return progress on a terminal or as lines, and the recording, which goes on where that of an earlier folder
+    ends."""
     from stitch.output.run_folder import recordings
     from stitch.recorder import RecorderGroup
 
-    return RecorderGroup([Progress(), *(recordings(folder) if recording else [])])
+    shown = recordings(folder) if recording else []
+    if shown and earlier is not None and (earlier / "recording.rrd").is_file():
+        copyfile(earlier / "recording.rrd", folder / "recording.rrd")
+    return RecorderGroup([Progress(), *shown])
 
 
 @cache

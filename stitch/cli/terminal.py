@@ -31,12 +31,13 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
     from stitch.system.lines import broken_lines, printable
     from stitch.system.process import console
 
-    terminal, text = console(stream or _answer_stream()), printable(text)
+    terminal, text = console(stream or answer_stream()), printable(text)
     lines = broken_lines(text, terminal.width, hang) if terminal.is_terminal else [text]
     terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
 
 
-def _answer_stream() -> IO[str] | None:
+def answer_stream() -> IO[str] | None:
+    """Return where what people read goes: standard output while a command `answers`, else None, standard error."""
     # Asked anew for each line: a command may keep descriptor 1 for its results and let it lead to 2 meanwhile.
     return results_stream() if _answers else None
 
@@ -79,7 +80,7 @@ def show_table(
 
     say(title, bold=True)
     widths = [max(map(cell_len, column)) for column in zip(headings, *rows, strict=True)]
-    terminal = console(_answer_stream())
+    terminal = console(answer_stream())
     if terminal.is_terminal and sum(widths) + 2 * len(widths) > terminal.width:
         for first, *cells in rows:
             named = ", ".join(f"{heading} {cell}" for heading, cell in zip(headings[1:], cells, strict=True))

@@ -87,10 +87,16 @@ class Prediction:
         return self.mean[stacks].reshape(C, k * m), covariance
 
 
-def deciding_views(linear: LinearModel, rivals: Sequence[Ranked], most: int = MOST_VIEWS) -> DecidingViews | None:
+def deciding_views(
+    linear: LinearModel, rivals: Sequence[Ranked], most: int = MOST_VIEWS, undecided: int = 0
+) -> DecidingViews | None:
     """Return the further views after which one of the rivals is most likely named; None where no pose tells them apart.
 
     Poses within reach, near those driven, from which the scanner sees the part as it has before.
+
+    Args:
+        undecided: so many rivals, the first, are held undecided by a verdict. Where the evidence so far would have
+            decided between them, it did not count there: then they are taken for equally likely.
     """
     scores = [ranked.score for ranked in rivals]
     if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
@@ -100,6 +106,9 @@ def deciding_views(linear: LinearModel, rivals: Sequence[Ranked], most: int = MO
     if isinstance(linear.observation, SurfaceObservation) and moves_points([scored.form.term for scored in scores]):
         return None
     log_weights = np.array([ranked.log_posterior for ranked in rivals])
+    group = log_weights[:undecided]
+    if undecided and np.ptp(group) > ODDS:
+        log_weights[:undecided] = group.max()
     joints = possible_joints(linear)[:_TRIED]
     if not len(joints):
         return None

@@ -68,7 +68,9 @@ def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
         group = _effects_to_separate(diagnosis)
         names = tuple(ranked.name for ranked in group)
         artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
-        views = deciding_views(diagnosis.linear, [*group, *_others_near(diagnosis, group)]) if group else None
+        rivals = [*group, *_others_near(diagnosis, group)] if group else []
+        undecided = len(group) if diagnosis.verdict == "cannot_tell" else 0
+        views = deciding_views(diagnosis.linear, rivals, undecided=undecided)
         if views is not None:
             return (*_poses(diagnosis.linear, names, views), *artefacts)
         unknown = least_known_view(diagnosis) if diagnosis.verdict == "unknown_effect" else None

@@ -12,7 +12,7 @@ from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.diagnosis.validation import CrossValidation
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.field_error import FieldError
-from stitch.output.finding_screen import finding_screen
+from stitch.output.finding_screen import clearest_parameter, finding_screen
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import parameter_row
 from stitch.output.schema import (
@@ -78,7 +78,7 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
     observable = ranked.score.observable
     inside, heldout = (None, None) if validation is None else diagnosis.rms_if_added(validation)
     detectable = {name: size for name, size in candidate.detectable.items() if np.isfinite(size)}
-    clearest = _clearest_parameter(candidate)
+    clearest = clearest_parameter(candidate)
     return {
         "effect": candidate.name,
         "p_value": ranked.adjusted if observable else None,
@@ -105,12 +105,6 @@ def _parameters(score: Score) -> dict[str, Any]:
         for p, value, sigma in zip(score.form.free, score.values, score.sigmas, strict=True):
             rows[p.name] = {"value": float(value), "sigma": float(sigma), "unit": p.unit}
     return rows
-
-
-def _clearest_parameter(candidate: CandidateEffect) -> str | None:
-    plausible = {p.name: p.typical for p in candidate.ranked.score.candidate.parameters}
-    detectable = candidate.detectable
-    return min(detectable, key=lambda name: detectable[name] / plausible[name]) if detectable else None
 
 
 def _field_map(scanner_error: FieldError | None) -> dict[str, Any] | None:

@@ -17,13 +17,14 @@ from stitch.diagnosis.effect_trend import (
     trend_of_dependence,
     trends_of_candidates,
 )
-from stitch.diagnosis.residual_structure import predicted_distances
+from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
 from stitch.diagnosis.sentences import fitted_amounts, odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
 from stitch.numerics.frames import Array
-from stitch.numerics.units import angle_text, length_text
+from stitch.numerics.least_squares import project_out
+from stitch.numerics.units import angle_text, display_unit, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.output.plain_finding import open_doubts
@@ -48,6 +49,8 @@ _FLAT = 0.02
 # A chance that needs no number.
 _PLAIN_CHANCE = 0.5
 _NAMING = ("missing_effect", "cannot_tell")
+# A source of less of the error than this share of its square has no place in a strip.
+_SEEN_SHARE = 1e-4
 
 
 @remembered
@@ -63,6 +66,8 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
         "certainty": certainty(diagnosis),
         "now": {"heldout": diagnosis.heldout_rms} | _on_part(present),
         "noise": diagnosis.noise_floor,
+        "sources": error_sources(diagnosis),
+        "unseen": unseen_text(diagnosis),
         "untested": untested_text(diagnosis),
         "formula": _formula(diagnosis),
         "why": _trend_row(why),
@@ -141,8 +146,6 @@ def _candidate_row(
 
 def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
     """Return whether a candidate fits these views, and why not where it does not."""
-    if candidate.name in diagnosis.effects:
-        return "yes"
     if diagnosis.verdict == "adequate":
         return "not needed"
     unit = diagnosis.linear.measurement.length_unit
@@ -151,10 +154,13 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
     if diagnosis.verdict == "unknown_effect":
         return f"no: it leaves {length_text(left, unit, 2)}"
     named = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0])
-    if named.cross_validation is not None:
+    is_named = candidate.name in diagnosis.effects
+    if named.cross_validation is not None and validation is not None:
         more = left - diagnosis.rms_if_added(named.cross_validation)[1]
         if more > _WORSE * left:
-            return f"no: it leaves {length_text(more, unit, 1)} more"
+            return f"{'yes, though' if is_named else 'no:'} it leaves {length_text(more, unit, 1)} more"
+    if is_named:
+        return "yes"
     against = named.ranked.score.log_bayes_factor - candidate.ranked.score.log_bayes_factor
     return f"no: the evidence is {odds_text(max(against, 0.0))} against it"
 
@@ -261,6 +267,70 @@ def untested_text(diagnosis: Diagnosis) -> str:
         told = " and ".join(map(describe_need, needs))
         lines.append(f"{' and '.join(names).capitalize()} {were} not tested: {they} {told}.")
     return " ".join(lines)
+
+
+def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return what the error on views left out comes from: kind, words and rms (length_unit); the squares add up to its
+    own.
+
+    What is named takes what it would take away; of the rest the scanner's noise, and what no motion of the views
+    removes. What is left then is shared out as the variances of whole views are: new in every view, or repeating.
+    """
+    total = diagnosis.heldout_rms**2
+    if not np.isfinite(total):
+        return []
+    sources = []
+    named = next((c for c in diagnosis.candidates if c.name in diagnosis.effects[:1]), None)
+    explained = 0.0
+    if named is not None and named.cross_validation is not None:
+        explained = max(total * (1 - named.cross_validation.heldout), 0.0)
+        sources.append(("effect", named.name, explained))
+    scanner = min(diagnosis.noise_floor**2, total - explained)
+    misfit = min(diagnosis.overlap_misfit**2, total - explained - scanner)
+    left = max(total - explained - scanner - misfit, 0.0)
+    beside = {*diagnosis.effects, *diagnosis.linear.model.effects, "sensor noise", "scanner field"}
+    shares = [(line.source, line.variance_share) for line in diagnosis.budget if line.source not in beside]
+    whole = sum(share for _, share in shares)
+    scatter = sum(share for source, share in shares if source in NOT_REPEATING) / whole if whole > 0 else 1.0
+    sources += [("arm", "arm's scatter", left * scatter), ("scanner", "scanner's noise", scanner)]
+    sources.append(("unexplained", "without a name", left * (1 - scatter) + misfit))
+    return [
+        {"kind": kind, "words": words, "rms": float(np.sqrt(square))}
+        for kind, words, square in sources
+        if square > _SEEN_SHARE * total
+    ]
+
+
+def unseen_text(diagnosis: Diagnosis) -> str:
+    """Return below which size effects do not show in these views, and how far they then move the views (rms).
+
+    Of the three that could move them most; empty where something is named, or no size is known.
+    """
+    if diagnosis.verdict != "adequate":
+        return ""
+    linear, unit = diagnosis.linear, diagnosis.linear.measurement.length_unit
+    hand_eye = linear.reduce(linear.design[:, :6])
+    told = []
+    for candidate in diagnosis.candidates:
+        name, every = clearest_parameter(candidate), candidate.ranked.score.candidate.forms[0]
+        k = next((k for k, p in enumerate(every.term.parameters) if p.name == name), 0)
+        size = candidate.detectable.get(name or "", np.inf)
+        if not np.isfinite(size):
+            continue
+        column = project_out(hand_eye, every.reduced[:, k : k + 1])
+        moved = size * float(np.linalg.norm(column)) / np.sqrt(max(linear.mixed.size, 1))
+        factor, shown = display_unit(every.term.parameters[k].unit)
+        amount = f"{name} = {factor * size:.2g} {shown}".rstrip()
+        told.append((moved, f"{candidate.name} below {amount} (moves views by {length_text(moved, unit, 2)})"))
+    largest = [text for _, text in sorted(told, reverse=True)[:_BEST]]
+    return f"Too small to show here: {'; '.join(largest)}." if largest else ""
+
+
+def clearest_parameter(candidate: CandidateEffect) -> str | None:
+    """Return the parameter that these views know best against its plausible size; None where none has a size."""
+    plausible = {p.name: p.typical for p in candidate.ranked.score.candidate.parameters}
+    detectable = candidate.detectable
+    return min(detectable, key=lambda name: detectable[name] / plausible[name]) if detectable else None
 
 
 def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) -> str:

@@ -352,6 +352,7 @@ _LEDGER_STEP = Document(
     Key("heldout_rms", NUMBER_OR_NULL),
     Key("noise_floor", NUMBER),
     Key("notes", _NOTE.rows(Note), when=attrgetter("notes")),
+    Key("predicted_heldout_rms", NUMBER, "predicted", when=lambda step: np.isfinite(step.predicted)),
 )
 LEDGER = _LEDGER_STEP.rows(LedgerStep)
 _STAGE = Document(

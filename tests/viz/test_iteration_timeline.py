@@ -1,13 +1,15 @@
 """The timelines iteration and view: every stage and iteration, every scan once, moved as the run moved it; all in the picture."""
 
+import re
 from dataclasses import replace
+from shutil import copyfile
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.api.pipeline import run
+from stitch.api.pipeline import change, run
 from stitch.numerics import frames
 from viz.blueprint import eye_for
 from viz.iteration_timeline import Moment, log_moments
@@ -22,9 +24,7 @@ def rows(path, entity, column):
         batch = chunk.to_record_batch()
         if chunk.entity_path == entity and column in batch.schema.names:
             lines = {
-                name: batch.column(name).to_pylist()
-                for name in ("iteration", "model", "view")
-                if name in batch.schema.names
+                name: batch.column(name).to_pylist() for name in ("iteration", "view") if name in batch.schema.names
             }
             values = batch.column(column).to_pylist()
             out += [({name: times[i] for name, times in lines.items()}, value) for i, value in enumerate(values)]
@@ -72,10 +72,41 @@ def test_every_scan_is_there_once_and_moves_as_the_run_moved_it(recorded):
         clouds = rows(path, f"/views/{view.name}", "Points3D:positions")
         assert len(clouds) == 1
         times, points = clouds[0]
-        assert times == {"iteration": 0, "model": 0, "view": v}
+        assert times == {"iteration": 0, "view": v}
         assert len(points) == min(len(view.cloud.points), 10_000)
-        for title, pose in (("correct ended", result.poses_model[v]), ("register ended", result.poses[v])):
-            assert pose_at(path, view.name, reached.index(title)) == pytest.approx(pose, abs=1e-4)
+        assert pose_at(path, view.name, reached.index("register ended")) == pytest.approx(result.poses[v], abs=1e-4)
+
+
+def test_motions_are_as_many_times_larger_as_is_said(recorded):
+    result, path = recorded
+    at = titles(path).index("correct ended")
+    (said,) = [text[0] for times, text in rows(path, "/now", "TextDocument:text") if times["iteration"] == at]
+    factor = float(re.search(r"displaced (\d+) times as far", said)[1])
+    where = frames.transform(result.poses[0], result.session.views[0].cloud.points[::50])
+    moved = {v: pose_at(path, view.name, at) for v, view in enumerate(result.session.views)}
+
+    def displacement(T, v):
+        return frames.transform(T @ frames.inverse(result.poses[v]), where) - where
+
+    shown = np.array([displacement(moved[v], v) for v in moved])
+    true = np.array([displacement(result.poses_model[v], v) for v in moved])
+    # A motion that all views share is not shown.
+    np.testing.assert_allclose(
+        shown - shown.mean(axis=0), factor * (true - true.mean(axis=0)), atol=0.02 * np.ptp(shown)
+    )
+    assert factor >= 10
+
+
+def test_the_recording_after_a_change_has_the_iterations_before_it(recorded, tmp_path):
+    result, path = recorded
+    before = titles(path)
+    copyfile(path, tmp_path / "t.rrd")
+    change(result, ["joint_offset"], RerunRecorder(tmp_path / "t.rrd"))
+    after = titles(tmp_path / "t.rrd")
+    fitted = before.index("correct ended") + 1
+    assert after[:fitted] == before[:fitted]
+    assert after[fitted] == "+ joint_offset: fit, iteration 1"
+    assert "+ joint_offset: correct ended" in after and after[-1] == "fuse"
 
 
 def test_a_view_that_is_left_out_stays_until_then(recorded, tmp_path):
@@ -87,7 +118,7 @@ def test_a_view_that_is_left_out_stays_until_then(recorded, tmp_path):
         for k in range(4)
     ]
     file = RecordingFile("stitch", tmp_path / "left-out.rrd")
-    log_moments(file.stream, result, moments, whole)
+    log_moments(file.stream, result, moments, whole, None)
     file.write()
     path = tmp_path / "left-out.rrd"
     assert [times for times, _ in rows(path, "/views/stray", "Clear:is_recursive")] == [{"iteration": 2}]

@@ -9,8 +9,8 @@ function partNumbers(data) {
   const triangles = Uint32Array.from(new (vertices.length / 3 > 65535 ? Uint32Array : Uint16Array)(bytes(data.triangles))), near = new Uint16Array(bytes(data.near));
   const weight = new Uint8Array(bytes(data.weight)), count = vertices.length / 3;
   const unpack = packed => {
-    const raw = new Int16Array(bytes(packed.data)), out = new Float32Array(raw.length);
-    for (let i = 0; i < raw.length; i++) out[i] = raw[i] === -32768 ? NaN : raw[i] * packed.count;
+    const raw = new (packed.bits === 8 ? Int8Array : Int16Array)(bytes(packed.data)), out = new Float32Array(raw.length), unknown = packed.bits === 8 ? -128 : -32768;
+    for (let i = 0; i < raw.length; i++) out[i] = raw[i] === unknown ? NaN : raw[i] * packed.count;
     return out;
   };
   const onVertices = values => {

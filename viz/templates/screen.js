@@ -23,15 +23,15 @@ function showScreen(root, part, found, um) {
     if (shown) return [
       { title: "Now", values: mapped(found.now.field), mean: found.now.mean * um },
       { title: `${found.verdict === "unknown_effect" ? "Nearest known effect" : "With"} ${shown.effect} (predicted)`, values: mapped(shown.field), mean: shown.mean * um }];
-    const { begin, end } = part, from = end > begin ? end - 1 : Math.max(0, begin - 1);
-    return [from, end].map(k => ({ title: k === end ? `Now${end > begin ? `, ${part.steps[k].name}` : ""}` : `Before: ${part.steps[k].name}`, values: own[k], mean: part.steps[k].mean }));
+    const { begin, end } = part, step = (k, title) => ({ title, values: own[k], mean: part.steps[k].mean });
+    return end > begin ? [step(end - 1, `Before: ${part.steps[end - 1].name}`), step(end, `Now, ${part.steps[end].name}`)] : [step(end, "Now"), step(end + 1, "Stitched cloud, each view moved")];
   }
 
   function draw() {
     if (!views.length) return;
     const both = pair(), one = part.views.find(v => v.index === view);
     both.forEach((state, i) => {
-      const k = i === both.length - 1 || shown ? part.end : Math.max(0, part.end - 1);
+      const k = shown ? part.end : part.end - (part.end > part.begin) + i;
       const signed = one && (i === 0 || !shown);
       const values = signed ? numbers.unpack(one.steps[k]) : state.values;
       views[i].show(values, signed ? part.fullSigned : part.full, Boolean(signed));
@@ -56,7 +56,7 @@ function showScreen(root, part, found, um) {
     }
   }
   // What the tiles speak of: the first picture beside a candidate, else the last.
-  const present = () => pair()[shown ? 0 : pair().length - 1];
+  const present = () => pair()[shown || part.end === part.begin ? 0 : 1];
   // Called the worst is what the tile says; the part's own patches may lie beside it.
   const isWorst = value => !shown || value > 0.95 * found.now.worst * um;
   const worstPatch = values => values.reduce((best, v, k) => Number.isFinite(v) && (best < 0 || v > values[best]) ? k : best, -1);

@@ -11,6 +11,8 @@ from stitch.run_data import RunData, doubt_headline
 
 # Expanded uncertainty: a place is within the tolerance if its distance and two standard errors are (ISO 14253-1).
 _COVERAGE = 2.0
+# Share of a predicted gain from which on a prediction was another one.
+_DIFFERS = 0.1
 Light = Literal["good", "check", "bad"]
 
 
@@ -41,7 +43,23 @@ def run_verdict(run: RunData, history: ModelHistory | None) -> str:
     """
     unit = run.session.length_unit
     agreement = _target_agreement(run) if history is None else plain_verdict(history, unit)
-    return " ".join([*run.doubts, agreement])
+    return " ".join(filter(None, [*run.doubts, agreement, prediction_text(run)]))
+
+
+def prediction_text(run: RunData) -> str:
+    """Return what was predicted of the last change of the model and what came, with a word where they differ.
+
+    They differ where a tenth of the predicted gain lies between them. Empty where nothing was predicted.
+    """
+    if len(run.ledger) < 2 or not np.isfinite(run.ledger[-1].predicted):
+        return ""
+    before, predicted, came = run.ledger[-2].heldout_rms, run.ledger[-1].predicted, run.ledger[-1].heldout_rms
+    unit = run.session.length_unit
+    told = [length_text(value, unit, 2) for value in (before, predicted, came)]
+    tenth = _DIFFERS * abs(before - predicted)
+    word = "less was gained" if came > predicted + tenth else "more was gained" if came < predicted - tenth else ""
+    differs = f": {word} than predicted" if word else ", as predicted"
+    return f"Predicted on held-out views: {told[0]} to {told[1]}; it came to {told[2]}{differs}."
 
 
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:

@@ -260,7 +260,9 @@ def hand_out(
         write_sessions(wanted.session, sessions())
     write_recording_and_page(command, wanted.recording, wanted.report, *results)
     if not wanted.as_json:
-        return console()
+        from stitch.cli.terminal import answer_stream
+
+        return console(answer_stream())
     print(json.dumps(document(), indent=1))
     return None
 

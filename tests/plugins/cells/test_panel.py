@@ -445,4 +445,4 @@ def test_a_simulated_panel_gets_its_shape_by_one_command(tmp_path, monkeypatch, 
     main_code(["synth", "panel-robots", "cell", "--seed", "3"])
     machine = f"{sys.executable} -m data_synth.cells.panel_job cell moves/shape_move.csv"
     main_code(["panel", "cell/job.toml", "-o", "moves", "--drive", machine])
-    assert "Shape control: 1 correction, " in capsys.readouterr().err
+    assert "Shape control: 1 correction, " in capsys.readou.out().err
