@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import isfinite
 from typing import TYPE_CHECKING
 
 from stitch.api.pipeline import change, diagnose
@@ -34,6 +35,8 @@ def effects_with(run: RunData, further: Sequence[str], where: object) -> list[st
 
 def with_prediction(run: RunData, heldout_rms: float) -> RunData:
     """Return the run with the error that a diagnosis predicted of the last change of its model; NaN: it did not."""
+    if not isfinite(heldout_rms):
+        return run
     return replace(run, ledger=(*run.ledger[:-1], replace(run.ledger[-1], predicted=heldout_rms)))
 
 

@@ -209,7 +209,7 @@ def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_aga
             recorder.finish(tried)
         return replace(fitted, tried={"backlash": "idle"}), [], None
 
-    def told_to(folder, recording):
+    def told_to(folder, recording, earlier):
         own = SilentRecorder()
         own.iteration = lambda stage, index, *_: told_of.append((stage, index))
         own.finish = lambda run: told_of.append(run.tried)
