@@ -118,3 +118,15 @@ def test_the_law_of_an_effect_that_was_added_is_drawn_as_it_was_before(cell):
     assert np.corrcoef(now.predicted, before.predicted)[0, 1] > 0.9
     assert np.std(now.after) < 0.7 * np.std(now.measured)
     assert np.isfinite(now.predicted_sigma).all() and now.predicted_sigma.max() < 3 * scatter
+
+
+def test_rivals_that_a_verdict_holds_undecided_are_not_decided_by_the_evidence_so_far(cell):
+    """Evidence that did not count for the verdict must not make its view as good as certain."""
+    found = cell[0]
+    first, second = rivals_of(found)
+    ahead = [replace(first, log_posterior=9.0), second]
+    alike = deciding_views(found.linear, [first, second], most=1, undecided=2)
+    held = deciding_views(found.linear, ahead, most=1, undecided=2)
+    believed = deciding_views(found.linear, ahead, most=1)
+    assert held.probability == pytest.approx(alike.probability)
+    assert believed is None or believed.probability[0] > 0.99

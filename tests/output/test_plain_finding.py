@@ -16,6 +16,7 @@ from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
+from stitch.output.comparison.run_verdict import prediction_text
 from stitch.output.diagnosis_document import _field_map
 from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_in_words
@@ -296,3 +297,38 @@ def test_a_map_is_written_with_null_where_nothing_was_seen():
     assert written["error"] == [[0.01, None], [-0.01, 0.0], [0.02, 0.03]]
     assert written["sigma"][0] == [0.002, None]
     assert _field_map(FieldError(0.02, 0.0, 9.0, over_noise=True)) is _field_map(None) is None
+
+
+@pytest.mark.parametrize("verdict", ["missing_effect", "adequate", "unknown_effect"])
+@pytest.mark.parametrize("misfit", [0.0, 0.01])
+def test_the_sources_of_the_error_add_up_to_it(verdict, misfit):
+    """Squares, as of independent errors; what is named takes what it would take away, whatever else there is."""
+    found = _found(verdict, 0.4, heldout=0.25)
+    vars(found).update(heldout_rms=0.05, noise_floor=0.02, overlap_misfit=misfit, budget=BUDGET)
+    found.linear = SimpleNamespace(model=SimpleNamespace(effects=()))
+    told = {source["kind"]: source["rms"] for source in finding_screen.error_sources(found)}
+    assert sum(rms**2 for rms in told.values()) == pytest.approx(0.05**2)
+    assert told["scanner"] == pytest.approx(0.02)
+    if verdict == "missing_effect":
+        assert told["effect"] ** 2 == pytest.approx(0.75 * 0.05**2)
+    else:
+        assert "effect" not in told
+
+
+def _changed(before, predicted, came):
+    steps = (SimpleNamespace(heldout_rms=before), SimpleNamespace(heldout_rms=came, predicted=predicted))
+    return SimpleNamespace(ledger=steps, session=SimpleNamespace(length_unit="mm"))
+
+
+@pytest.mark.parametrize(
+    ("came", "word"),
+    [
+        (0.054, ": less was gained than predicted."),
+        (0.042, ", as predicted."),
+        (0.02, ": more was gained than predicted."),
+    ],
+)
+def test_what_was_predicted_stands_beside_what_came(came, word):
+    said = prediction_text(_changed(0.09, 0.04, came))
+    assert said == f"Predicted on held-out views: 90 µm to 40 µm; it came to {came * 1e3:.0f} µm{word}"
+    assert prediction_text(_changed(0.09, float("nan"), came)) == ""
