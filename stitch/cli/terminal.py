@@ -17,8 +17,6 @@ _SPELT = {"µ": "u", "μ": "u", "–": "-", "—": "-", "±": "+-", "×": "x", "
 # Where results go, and whether headlines alone are printed: of the innermost command that runs.
 _results: list[IO[str]] = []
 _briefly: list[bool] = []
-# While it holds anything, lines and tables for people are a command's result.
-_answers: list[bool] = []
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
@@ -29,27 +27,20 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
         stream: where it goes; None is standard error, or standard output while a command `answers`.
     """
     from stitch.system.lines import broken_lines, printable
-    from stitch.system.process import console
+    from stitch.system.process import answer_stream, console
 
     terminal, text = console(stream or answer_stream()), printable(text)
     lines = broken_lines(text, terminal.width, hang) if terminal.is_terminal else [text]
     terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
 
 
-def answer_stream() -> IO[str] | None:
-    """Return where what people read goes: standard output while a command `answers`, else None, standard error."""
-    # Asked anew for each line: a command may keep descriptor 1 for its results and let it lead to 2 meanwhile.
-    return results_stream() if _answers else None
-
-
 @contextmanager
 def answers() -> Iterator[None]:
     """While the block lasts, lines and tables for people are the result of a command: they go to standard output."""
-    _answers.append(True)
-    try:
+    from stitch.system.process import answers_to
+
+    with answers_to(results_stream):
         yield
-    finally:
-        _answers.pop()
 
 
 def show_block(rows: Sequence[tuple[str, str]]) -> None:
@@ -76,7 +67,7 @@ def show_table(
     """
     from rich.cells import cell_len
 
-    from stitch.system.process import console
+    from stitch.system.process import answer_stream, console
 
     say(title, bold=True)
     widths = [max(map(cell_len, column)) for column in zip(headings, *rows, strict=True)]

@@ -18,6 +18,7 @@ Item = TypeVar("Item")
 # What is worked on, how many are done, of how many; of none where nobody knows.
 Watcher = Callable[[str, int, int], None]
 _watchers: list[Watcher] = []
+_answers: list[Callable[[], IO[str]]] = []
 # Seconds until a line says what is done, and until the next one.
 QUIET = 2.0
 AGAIN = 10.0
@@ -77,6 +78,22 @@ def tell_seconds(step: str) -> Iterator[None]:
         yield
     finally:
         ended.set()
+
+
+@contextmanager
+def answers_to(stream: Callable[[], IO[str]]) -> Iterator[None]:
+    """While the block lasts, what people read goes to the stream that this returns: it is a command's result."""
+    _answers.append(stream)
+    try:
+        yield
+    finally:
+        _answers.pop()
+
+
+def answer_stream() -> IO[str] | None:
+    """Return where what people read goes; None is standard error."""
+    # Asked anew for each line: a command may keep descriptor 1 for its results and let it lead to 2 meanwhile.
+    return _answers[-1]() if _answers else None
 
 
 def console(file: IO[str] | None = None) -> Console:

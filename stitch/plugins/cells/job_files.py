@@ -29,7 +29,7 @@ from stitch.output.session_files import SessionFiles, TableColumns, write_sessio
 from stitch.session.reading.csv_files import finite_number, read_csv_lines
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
-from stitch.system.process import console
+from stitch.system.process import answer_stream, console
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
 LOWEST_VALUE = 1e-12
@@ -260,8 +260,6 @@ def hand_out(
         write_sessions(wanted.session, sessions())
     write_recording_and_page(command, wanted.recording, wanted.report, *results)
     if not wanted.as_json:
-        from stitch.cli.terminal import answer_stream
-
         return console(answer_stream())
     print(json.dumps(document(), indent=1))
     return None
