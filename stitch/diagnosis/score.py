@@ -26,8 +26,9 @@ from stitch.model.model import Model, geometry_terms, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.numerics.distributions import chi2_limit, f_tail
 from stitch.numerics.frames import Array, Mask
+from stitch.numerics.least_squares import column_space
 from stitch.numerics.parameter_selection import log_evidence_at_scales, log_mixture
-from stitch.numerics.reml import NOISE, FurtherColumns, at_variances, fit_variances
+from stitch.numerics.reml import NOISE, USUAL_NOISE_FACTOR, FurtherColumns, at_variances, fit_variances
 from stitch.numerics.units import METRES
 from stitch.numerics.variance_posterior import satterthwaite
 from stitch.observations.linear_model import LinearModel
@@ -317,18 +318,29 @@ def expected_scatter(linear: LinearModel, limit: ScatterLimit) -> ScatterLimit:
 def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
     """Return whether the views show more than an expected scatter leaves, and chance explains.
 
-    Rotations and translations count together, as far as each of them moves what is seen: these views may not tell
-    them apart. All that is left counts as scatter, what follows a law too.
+    What is left of all numbers, each in units of its noise as the residual counts them, is a square whose mean and
+    variance follow from the expected covariance (Satterthwaite). Nothing is estimated: what no scatter explains could
+    hide in an estimate of it.
     """
-    linear = linear.restricted(())
-    shown = np.trace(linear.mixed.components[:NOISE], axis1=2, axis2=3).sum(axis=1)
-    variances = linear.null.variances.copy()
-    variances[:NOISE] = expected.rotation**2, expected.translation**2
-    shares = variances[:NOISE] * shown / max(float(variances[:NOISE] @ shown), 1e-300)
-    spread = satterthwaite(linear.mixed, at_variances(linear.mixed, variances)).spread[:NOISE, :NOISE]
-    known = 2 / max(float(shares @ spread @ shares), 1e-9)
-    ratio = float(linear.null.variances[:NOISE] @ shown) / max(float(variances[:NOISE] @ shown), 1e-300)
-    return ratio > chi2_limit(limits.ALPHA_UNKNOWN / 2, known) / known
+    mixed = linear.mixed
+    noise = np.diagonal(mixed.components[NOISE], axis1=1, axis2=2)
+    unit = 1 / np.sqrt(np.maximum(noise, 1e-300))
+    variances = np.array([expected.rotation**2, expected.translation**2, USUAL_NOISE_FACTOR])
+    covariance = np.einsum("c,cbij->bij", variances, mixed.components[: NOISE + 1])
+    covariance = covariance * unit[:, :, None] * unit[:, None]
+    white = (mixed.A * unit[:, :, None]).reshape(-1, mixed.A.shape[2])
+    mean = column_space(white).reshape((*mixed.A.shape[:2], -1))
+    left = (mixed.z * unit).ravel()
+    flat = mean.reshape(len(left), -1)
+    left = left - flat @ (flat.T @ left)
+    # tr(MC) and tr(MCMC) with M = 1 − UUᵀ.
+    along = covariance @ mean
+    within = np.einsum("bik,bil->kl", mean, along)
+    total = float(np.trace(covariance, axis1=1, axis2=2).sum() - np.trace(within))
+    squares = float((covariance**2).sum() - 2 * (along**2).sum() + (within**2).sum())
+    known = max(total**2 / max(squares, 1e-300), 1e-9)
+    chance = limits.ALPHA_UNKNOWN / 2 if expected.stated else limits.ALPHA
+    return float(left @ left) > total * chi2_limit(chance, known) / known
 
 
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:

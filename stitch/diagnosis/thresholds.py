@@ -31,8 +31,8 @@ UNDETECTABLE_SQUARE = 1e6
 # (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
 IMPLAUSIBLE = (2.5e-4, 0.12)
 # Times the scatter of a usual flange and usual joints together, up to which what is left is that of an ordinary arm:
-# the simulator's arms, with joints that scatter or without, have 0.4 to 0.9 of it.
-ORDINARY_SCATTER = 1.3
+# the simulator's arms, with joints that scatter or without, leave 0.4 to 1.0 of it.
+ORDINARY_SCATTER = 1.1
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas (custom).
 SEEN_SIGMAS = 0.5
