@@ -278,6 +278,7 @@ class Likelihood:
     errors: InverseCovariance | PairWeights  # of the numbers
     sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
     of_variances: float  # of the deviance, what no mean changes
+    prior_slope: Array  # (c,) of −2 log prior of the log variances
 
     @property
     def covariance(self) -> Array:
@@ -310,7 +311,7 @@ class Likelihood:
                 taken = (flatten_blocks(W @ columns.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
                 against = W - taken @ taken.transpose(0, 2, 1)
                 slopes += mixed.components[:, at].reshape(len(slopes), -1) @ against.ravel()
-        return np.exp(self.log_variances) * slopes + log_prior(self.log_variances, mixed.further)[1]
+        return np.exp(self.log_variances) * slopes + self.prior_slope
 
     @property
     def curvature(self) -> Array:
@@ -358,7 +359,8 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     k = len(problem.precision)
     if not np.isfinite(errors.logdet):
         nothing = np.zeros((k + 1, k + 1))
-        return Likelihood(problem, log_variances, 1e300, nothing[0, :k], nothing[:k, :k], errors, nothing, 1e300)
+        flat = np.zeros(len(log_variances))
+        return Likelihood(problem, log_variances, 1e300, nothing[0, :k], nothing[:k, :k], errors, nothing, 1e300, flat)
     if isinstance(errors, PairWeights):
         sums = np.tensordot(errors.pairs, columns.products, axes=1)
     else:
@@ -377,9 +379,9 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
         rest = (flatten_blocks(columns.Xz) @ of_rest).reshape(*mixed.z.shape, 1)
         square = float(np.sum((errors.half @ rest) ** 2))
     square += float(mean @ (problem.precision * mean))
-    prior = log_prior(log_variances, mixed.further)[0]
+    prior, prior_slope = log_prior(log_variances, mixed.further)
     value = errors.logdet + of_information + problem.offset + square + prior
-    return Likelihood(problem, log_variances, value, mean, half, errors, sums, errors.logdet + prior)
+    return Likelihood(problem, log_variances, value, mean, half, errors, sums, errors.logdet + prior, prior_slope)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
@@ -506,9 +508,8 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihoo
     for _ in range(_SCORINGS):
         if np.abs(here.slope).max() < flat:
             return here
-        prior_slope = log_prior(here.log_variances, mixed.further)[1]
         prior_curvature = 2 * prior_information(np.exp(here.log_variances), mixed.further)
-        step = _scoring_step(here.curvature, here.slope, prior_slope, prior_curvature)
+        step = _scoring_step(here.curvature, here.slope, here.prior_slope, prior_curvature)
         gain = -0.5 * float(here.slope @ step)
         if gain < _CONVERGED:
             return here
