@@ -138,10 +138,11 @@ def killed_summary(rows: list[Row]) -> list[str]:
     for command, group in grouped([row for row in rows if row["killed"]], "command").items():
         left = Counter(row["left"] for row in group)
         failed = sum(not row["works"] for row in group)
+        last = max(row["event"] for row in group)
         sentences.append(
-            f"`{command}` killed after each of its first {len(group)} changes of the folder: {left['old']} times the "
-            f"old run is left, {left['new']} times the new one, {left['neither']} times neither; {failed} times the "
-            "next command fails."
+            f"`{command}` killed {len(group)} times, 1 ms after one of the changes 1 to {last} "
+            f"of its folder: {left['old']} times the old run is left, {left['new']} times the new one, "
+            f"{left['neither']} times neither; {failed} times the next command fails."
         )
     return sentences
 
