@@ -79,9 +79,13 @@ def suggest(
         lines += finding.lines
         if diagnosis is not None and (why := _reason_to_stop(diagnosis, left, at_most)) is not None:
             fewer, happened = (None, []) if result is None else _drop_idle(result, given, recorder)
-            if fewer is not None and happened:
-                return fewer, [*lines, *why, *happened], diagnose(fewer)
-            return result, [*lines, *why], diagnosis
+            if fewer is None or not happened:
+                return result, [*lines, *why], diagnosis
+            # In their place others may be added.
+            lines += happened
+            left += len(happened)
+            state = result = fewer
+            continue
         known = None
         before = result
         result, happened = _add_found(state, finding, left, given, recorder)
@@ -204,19 +208,32 @@ def _finding_and_evidence(diagnosis: Diagnosis) -> list[str]:
 
 
 def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
-    """Return the run without added effects of which in the end no parameter differs from zero, and what was dropped."""
-    from stitch.diagnosis.thresholds import FAINT_SIGMAS
+    """Return the run without added effects of which in the end no parameter differs from zero, or without which views
+    left out are predicted better, and what was dropped.
+
+    Scans are matched anew without an effect, which alone changes what views left out say: there it must be clear.
+    """
+    from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_RISE
 
     lines: list[str] = []
     while True:
         added = [term for term in result.terms if term.name in result.model.effects and term.name not in given]
-        faint = next((term for term in added if term.sigmas_from_zero < FAINT_SIGMAS), None)
-        if faint is None:
-            return result, lines
-        reason = f"{faint.name} ends with no parameter that differs from zero"
+        fewer = {t.name: [name for name in result.effects if name != t.name] for t in added}
+        faint = next((term.name for term in added if term.sigmas_from_zero < FAINT_SIGMAS), None)
+        if faint is not None:
+            without = {faint: change(result, fewer[faint])}
+            reason = f"{faint} ends with no parameter that differs from zero"
+        else:
+            without = {name: change(result, others) for name, others in fewer.items()}
+            faint = min(without, key=lambda name: without[name].heldout_or_fit_rms, default=None)
+            least = 1.0 if faint is None else without[faint].heldout_or_fit_rms / result.heldout_or_fit_rms
+            if faint is None or least * (HELDOUT_RISE if result.session.has_clouds else 1.0) >= 1.0:
+                return result, lines
+            reason = f"without {faint} views left out are predicted better in the end"
         lines.append(f"{reason}; it was dropped.")
-        fewer = change(result, [name for name in result.effects if name != faint.name], recorder)
-        result = replace(fewer, tried=result.tried | {faint.name: reason})
+        if recorder is not None:
+            without[faint] = change(result, fewer[faint], recorder)
+        result = replace(without[faint], tried=result.tried | {faint: reason})
 
 
 def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:

@@ -208,6 +208,7 @@ def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
 
 def remarks(result: RunData) -> list[str]:
     """Return whether the effects earned their place, and whether they are of a believable size."""
+    from stitch.diagnosis.ranking import beyond_belief_text
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 
     lines: list[str] = []
@@ -222,9 +223,9 @@ def remarks(result: RunData) -> list[str]:
             rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
             lines.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
     for term in (term for term in result.terms if not term.is_geometry):
-        wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
+        wild = [p.name for p in term.parameters if p.fitted and not p.held and p.beyond_belief(p.value, p.sigma)]
         if wild:
-            lines.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
+            lines.append(f"{term.name}: {beyond_belief_text(wild)}.")
         if term.sigmas_from_zero < FAINT_SIGMAS:
             lines.append(
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "

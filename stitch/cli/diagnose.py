@@ -33,14 +33,19 @@ def diagnose_run(
 ) -> None:
     """Say which physical effect is missing in the model of a run, or why nobody can tell.
 
+    Of the folder of several sessions of one arm: what they decide together.
+
     \b
     Examples:
       stitch diagnose runs/blade-17
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
-    from stitch.output.json_file import to_json
+    from stitch.output.json_file import runs_of_rig, to_json
     from stitch.output.plain_finding import suggested_command
 
+    if sessions := runs_of_rig(run):
+        _diagnose_together([run / name for name in sessions], effects_file, trust, as_json)
+        end_at_once()
     diagnosis, document = diagnose_folder(run, effects_file, trust)
     if as_json:
         emit(to_json(document))
@@ -48,6 +53,29 @@ def diagnose_run(
         show_diagnosis(diagnosis)
         show_next(suggested_command(diagnosis, shlex.quote(str(run))))
     end_at_once()
+
+
+def _diagnose_together(runs: Sequence[Path], effects_file: Path | None, trust: bool, as_json: bool) -> None:
+    """Print what several sessions of one arm decide together."""
+    from stitch.diagnosis.diagnose import linear_model_of
+    from stitch.diagnosis.together import decide_together, together_document, together_sentence
+    from stitch.output.json_file import to_json
+    from stitch.output.stored_run import load_run
+
+    with show_activity("diagnosing: trying every effect"):
+        states = [load_run(run, effects_file, trust) for run in runs]
+        together = decide_together([linear_model_of(state) for state in states])
+    names = [state.session.name for state in states]
+    if as_json:
+        emit(to_json(together_document(together, names)))
+        return
+    say(f"{', '.join(names)} together: {together_sentence(together)}", bold=True)
+    columns = (("effect", lambda c: c.name), ("log posterior", lambda c: f"{c.log_posterior:.1f}"))
+    show_columns("Likeliest effects of the arm", columns, together.candidates[:_LISTED_CANDIDATES])
+    if together.verdict == "missing_effect":
+        sessions = " ".join(shlex.quote(str(state.session.path)) for state in states)
+        folder = shlex.quote(str(runs[0].parent))
+        show_next(f"Next: stitch run {sessions} -o {folder} --force --effects {','.join(together.effects)}")
 
 
 def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:

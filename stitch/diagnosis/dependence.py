@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis.systematic_laws import STEP, Law, dictionary_of
-from stitch.diagnosis.thresholds import DEPENDENCE_BINS
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.systematic_laws import STEP, Law, Span, dictionary_of
+from stitch.diagnosis.thresholds import DEPENDENCE_BINS, FAINT_SIGMAS
 from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space, fit_columns
@@ -25,6 +26,8 @@ FOLLOWS = 0.01
 _AS_WELL = 20.0
 # Columns of which less than this share is new beside the model say nothing; nor does what is smaller than the second.
 _NEW_SHARE, _NOTHING = 1e-4, 1e-9
+# Covariates that correlate but for so little are one.
+_ALIKE = 1e-9
 # Laws whose scatter is fitted anew, the clearest, and of more numbers than these (time).
 _REFITTED, _FEW_NUMBERS, _REFITTED_OF_MANY = 12, 400, 3
 
@@ -63,17 +66,23 @@ def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
     return tuple(x for x in followed if x.clear and x.p_beside < FOLLOWS)
 
 
-def dependences(linear: LinearModel) -> tuple[Dependence, ...]:
-    """Find what the displacements of whole views follow, clearest first; () where too few numbers are free."""
+def dependences(linear: LinearModel, named: Sequence[Ranked] = ()) -> tuple[Dependence, ...]:
+    """Find what the displacements of whole views follow, clearest first; () where too few numbers are free.
+
+    Args:
+        named: effects that are said to be missing: of columns that are one in these views, theirs is listed alone.
+    """
     linear = linear.restricted(())
     laws = [law for law in dictionary_of(linear).laws if law.is_whole]
     if not laws:
         return ()
     columns = [law.reduced(linear.observation) for law in laws]
     p_values = _p_values(linear, columns)
+    alike = _followed_alike(laws, columns, named)
     best: dict[str, int] = {}
     for k in np.argsort(p_values, kind="stable"):
-        best.setdefault(laws[k].driver.name, int(k))
+        if laws[k].driver.name not in alike:
+            best.setdefault(laws[k].driver.name, int(k))
     first, *others = best.values()
     beside = dict(
         zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
@@ -84,6 +93,19 @@ def dependences(linear: LinearModel) -> tuple[Dependence, ...]:
         _dependence(linear, laws[k], columns[k], displacement, tried * p_values[k], tried * beside.get(k, 1.0))
         for k in best.values()
     )
+
+
+def _followed_alike(laws: Sequence[Law], columns: Sequence[Array], named: Sequence[Ranked]) -> set[str]:
+    """Return covariates that run in these views as one does that a named effect follows, and are not its own."""
+    clear = [Span(r.score.form.columns[:, np.abs(r.score.values) > FAINT_SIGMAS * r.score.sigmas]) for r in named]
+    own = {
+        law.driver.name: law.driver.values
+        for law, X in zip(laws, columns, strict=True)
+        if law.place.joint is None or law.driver.name.startswith(f"j{law.place.joint}_")
+        if any(of_effect.contains(Span(X)) for of_effect in clear)
+    }
+    others = {law.driver.name: law.driver.values for law in laws if law.driver.name not in own}
+    return {name for name, x in others.items() if any(abs(np.corrcoef(x, y)[0, 1]) > 1 - _ALIKE for y in own.values())}
 
 
 def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:

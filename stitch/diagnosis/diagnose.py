@@ -7,9 +7,9 @@ import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.dependence import dependences
-from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, too_large
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.evidence import find_scanner_error, gather_evidence, overlap_misfit_beyond_noise
-from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, rank_one
+from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, rank_one, too_large
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import follows_field, variance_budget
 from stitch.diagnosis.score import expected_scatter, scatter_limit
@@ -84,7 +84,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         translation=translation,
         candidates=tuple(examined),
         matrix=matrix,
-        depends_on=dependences(linear),
+        depends_on=dependences(linear, evidence.named),
         missing=missing,
         linear=linear,
         notes=evidence.notes,

@@ -1,6 +1,5 @@
 """What a diagnosis says: verdict, candidate effects, what depends on what, what to measure next."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +8,7 @@ from stitch.diagnosis.dependence import Dependence
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.thresholds import BELIEVABLE_SIZES, ODDS
+from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError, TimeCurve, reportable
 from stitch.diagnosis.validation import CrossValidation
@@ -63,16 +62,6 @@ class Finding:
     validations: dict[str, CrossValidation]  # of candidates, by name
 
 
-def too_large(named: Sequence[Ranked]) -> tuple[str, ...]:
-    """Return the parameters of what is named that clearly are larger than ten times their usual size; of a group only
-    where each of its effects has such."""
-    names = list[list[str]]()
-    for scored in (r.score for r in named):
-        clear = np.abs(scored.values) - 2 * scored.sigmas > BELIEVABLE_SIZES * scored.form.sizes
-        names.append([p.name for p, large in zip(scored.form.free, clear, strict=True) if large])
-    return tuple(names[0]) if names and all(names) else ()
-
-
 @dataclass(frozen=True, eq=False)
 class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_document", table="candidates"):
     """Verdict, candidate effects, what the rest depends on, what to measure next.
@@ -116,7 +105,7 @@ class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_docu
     doubts: tuple[str, ...] = ()
     coincidence: str = ""  # of `Evidence`
     laws: tuple[Ranked, ...] = ()  # of the dictionary: rivals of what is named, or what is found where nothing is
-    beyond_belief: tuple[str, ...] = ()  # parameters of what is named that are ten times their usual size
+    beyond_belief: tuple[str, ...] = ()  # parameters of what is named that are larger than is believed of them
     together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why
     answers: tuple[Answer, ...] = ()  # of the questions that led to the verdict; the last that changed it decided

@@ -19,6 +19,7 @@ from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.ranking import (
     Ranked,
+    beyond_belief_text,
     conditioned_on_effects,
     is_certain,
     is_contender,
@@ -27,9 +28,11 @@ from stitch.diagnosis.ranking import (
     rank_one,
     rescored_against,
     stands_out,
+    too_large,
 )
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, score
+from stitch.diagnosis.sensitivity import imitated_share
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
 from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
 from stitch.diagnosis.unmodelled_time_effects import (
@@ -40,7 +43,7 @@ from stitch.diagnosis.unmodelled_time_effects import (
 from stitch.diagnosis.validation import CrossValidation, cross_validate, objection_in_halves
 from stitch.diagnosis.verdict import Answer, Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
-from stitch.model.model import Term
+from stitch.model.model import ARM_PLACES, Term
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
@@ -356,14 +359,17 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     These views cannot tell it from those. One that predicts them clearly better and stands every other test takes the
     place of the name: a Bayes factor charges for plausible sizes that may be wrong, as a user's are, and what was not
     seen does not. What a second effect leaves on views left out may hide by how much the first predicts them better.
+    What begins at some view may begin at nearly the first, where it is what lasts: of such the odds decide.
     """
     if evidence.verdict != "missing_effect" or evidence.second is not None:
         return None
     named = evidence.named[0]
+    least = next(r.log_posterior for r in evidence.ranked if r.name == named.name) - limits.ODDS
     rivals = {
         r.name: r
         for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
         if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
+        if r.log_posterior > least or not any(p.discrete for p in r.score.candidate.parameters)
     }
     of_rivals = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
     left_out = dict(evidence.left_out) | of_rivals
@@ -377,6 +383,66 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
         if pair is not None:
             return Reply(f"none beside {pair[1].name}", _naming(pair))
     return Reply(_names(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
+
+
+def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | None:
+    """Is an effect that alone explains more than the name not needed beside what is named?
+
+    If it is wanted all the same, these views cannot tell the two apart, or of few views both are missing.
+    """
+    first = evidence.ranked[0]
+    named = evidence.named[:1]
+    missing = {r.name for r in (*named, *evidence.together, evidence.second) if r is not None}
+    if evidence.verdict != "missing_effect" or first.name in missing or not is_contender(first):
+        return None
+    if any(first.name in note for note in evidence.notes):
+        return Reply("what speaks against it is said")
+    tests = len(evidence.ranked)
+    beside = conditioned_on_effects(case.linear, evidence.together or named)
+    again = rank_one(beside, first.score.candidate, tests)
+    if not is_certain(again):
+        return Reply(f"no: {first.name} is not")
+    other = rank_one(conditioned_on_effects(case.linear, [first]), named[0].score.candidate, tests)
+    if is_certain(other) and not case.many_views:
+        return Reply(f"both are missing: {_names((other, again))}", _naming((other, again)))
+    return Reply(f"yes: {first.name}", {"explanation": (*named, first), "further": None, "together": ()})
+
+
+def does_the_arm_do_what_hangs_at_it(case: Case, evidence: Evidence) -> Reply | None:
+    """Does an effect of the arm do what a holder of light targets is said to do?
+
+    Over a sweep of few joints gravity bends either alike, and reflectors weigh grams: these views cannot tell.
+    """
+    linear = case.linear
+    if evidence.verdict != "missing_effect" or linear.measurement.capture.scans:
+        return None
+    scored = evidence.named[0].score
+    if not any(need.startswith("gravity_at") for need in scored.candidate.effect.needs):
+        return None
+    pattern = linear.residual(scored.form.columns) @ scored.values
+    alike = []
+    for r in filter(is_contender, evidence.ranked):
+        whole = r.score.candidate.forms[0]
+        of_arm = r.score.candidate.effect.place in ARM_PLACES and not whole.term.gridded.any()
+        if of_arm and imitated_share(pattern, linear.residual(whole.columns) * whole.sizes) > limits.ALIAS_CORRELATION:
+            alike.append(r)
+    changes = {"explanation": (*alike, *evidence.named), "further": None, "together": ()} if alike else {}
+    return Reply(_names(alike) or "no", changes)
+
+
+def is_its_size_believable(case: Case, evidence: Evidence) -> Reply | None:
+    """Is the name of a believable size, or else another that is missing beside it, which then goes first?"""
+    large = too_large(evidence.named) if evidence.verdict == "missing_effect" else ()
+    if not large:
+        return None
+    first, *others = evidence.together or _named_effects(evidence)
+    believable = next((r for r in others if not too_large((r,))), None)
+    if believable is None:
+        return Reply("no, and there is no other")
+    rest = (first, *(r for r in others if r is not believable))
+    note = f"{first.name} is missing too, but {beyond_belief_text(large)}"
+    changes = {"explanation": (believable,), "further": rest[0], "together": (believable, *rest)}
+    return Reply(f"{believable.name} is", {**changes, "notes": (*evidence.notes, note)})
 
 
 def does_a_joint_turn_back(case: Case, evidence: Evidence) -> Reply | None:
@@ -410,6 +476,9 @@ TESTS: tuple[Question, ...] = (
     does_the_scanner_explain_it,
     does_it_hold_with_a_second,
     which_predict_as_well,
+    is_a_likelier_effect_not_needed,
+    does_the_arm_do_what_hangs_at_it,
+    is_its_size_believable,
     does_a_joint_turn_back,
 )
 

@@ -82,6 +82,21 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
     return tuple(r for r in ranked if r.physical), tuple(r for r in ranked if not r.physical)
 
 
+def too_large(named: Sequence[Ranked]) -> tuple[str, ...]:
+    """Return the parameters of what is named that are larger than is believed of them; of a group only where each of
+    its effects has such."""
+    names = list[list[str]]()
+    for scored in (r.score for r in named):
+        fitted = zip(scored.form.free, scored.values, scored.sigmas, strict=True)
+        names.append([p.name for p, value, sigma in fitted if p.beyond_belief(value, sigma)])
+    return tuple(names[0]) if names and all(names) else ()
+
+
+def beyond_belief_text(names: Sequence[str]) -> str:
+    """Return which parameters are larger than is believed of them."""
+    return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} larger than is believable"
+
+
 def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
     """Return the ranking where something else has this log posterior beside `best`: all shares make room."""
     share = next(r for r in ranked if r.name == best.name).posterior

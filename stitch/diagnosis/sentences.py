@@ -5,10 +5,10 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.ranking import Ranked, beyond_belief_text
 from stitch.diagnosis.residual_structure import NOT_REPEATING
 from stitch.diagnosis.systematic_laws import law_of, law_size
-from stitch.diagnosis.thresholds import BELIEVABLE_SIZES, CLEAR_DEPENDENCE, ODDS
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.effects.contract import EFFECTS
@@ -72,9 +72,8 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     if _SCALE in (candidate.name, pair[1].name if pair else ""):
         # Scans, hand-eye and ways of the arm, all longer by the same share, fit each other as before.
         yield "These views cannot tell it from arm lengths that are all off by the same share; a known length can."
-    if large := d.beyond_belief:
-        verb = "is" if len(large) == 1 else "are"
-        yield f"{_listed(large, 'and')} {verb} more than {BELIEVABLE_SIZES:g} times the usual size: check session.toml."
+    if d.beyond_belief:
+        yield f"{beyond_belief_text(d.beyond_belief)}: check session.toml."
 
 
 def _what_looks_the_same(d: Diagnosis, name: str) -> str:
@@ -94,10 +93,10 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
         return
     yield f"Alone, {first.name} would explain more (posterior {first.ranked.posterior:.2f})."
     objection = next((note for note in d.notes if first.name in note), None)
-    if first.name in d.together:
-        yield f"It is missing too; beside it, most stays unexplained without {named}."
-    elif objection is not None:
+    if objection is not None:
         yield f"But {objection}."
+    elif first.name in d.together:
+        yield f"It is missing too; beside it, most stays unexplained without {named}."
     else:
         yield f"Beside {' and '.join(d.together or d.effects)} it is not needed."
 

@@ -264,9 +264,13 @@ def find_exchange(
 def _better_extrapolating_effects(
     rest: LinearModel, candidates: Sequence[Candidate], at_ends: Extrapolation
 ) -> list[Ranked]:
-    """Return effects that are likelier to hold at a further end than one that was found, the likeliest first."""
+    """Return effects that are likelier to hold at a further end than one that was found, the likeliest first.
+
+    What begins at some view has no ends of its own: from the second view on it is what it imitates.
+    """
     better = list[tuple[float, Ranked]]()
-    for candidate, _ in promising(rest, candidates, limits.CANDIDATES_TRIED):
+    lasting = [c for c in candidates if not any(p.discrete for p in c.parameters)]
+    for candidate, _ in promising(rest, lasting, limits.CANDIDATES_TRIED):
         other = rank_one(rest, candidate, len(candidates))
         its_ends = extrapolate(rest, other.score) if is_certain(other) else None
         if its_ends is not None and its_ends.helps and its_ends.likely > at_ends.likely:

@@ -141,8 +141,19 @@ class Dictionary:
     observation: Observation
 
     def credited(self, effect: Ranked, laws: Sequence[Ranked]) -> Ranked:
-        """Return an effect with the evidence of the law that it says, which may be of one axis where it has six."""
-        said = [r.score.log_bayes_factor for r in laws if effect.name in self.said_by[law_of(r).key]]
+        """Return an effect with the evidence of the law that it says, which may be of one axis where it has six.
+
+        A law has several shapes, of which an effect may say one: a wave twice a turn is none once a turn. And it is of
+        one joint, which an effect does not tell before: of so many joints, each alone or all together.
+        """
+        whole = _whole_forms(effect.score.candidate)
+        joints = sum(place is not None for place in {law.place.joint for law in self.laws})
+        said = [
+            r.score.log_bayes_factor - (float(np.log(2 * joints)) if law_of(r).place.joint else 0.0)
+            for r in laws
+            if effect.name in self.said_by[law_of(r).key]
+            and any(form.contains(Span(r.score.form.columns)) for form in whole)
+        ]
         more = max([0.0, *(factor - effect.score.log_bayes_factor for factor in said)])
         return replace(effect, log_posterior=effect.log_posterior + more)
 
@@ -179,13 +190,13 @@ class Dictionary:
         """Return those of some laws that an effect does not say, nor does at its own place in these views."""
         rivals = [r for r in laws if effect.name not in self.said_by[law_of(r).key]]
         place = effect.score.candidate.effect.place
-        explained = _Span(linear.residual(effect.score.form.columns))
+        explained = Span(linear.residual(effect.score.form.columns))
         return tuple(
             r
             for r in rivals
             if law_of(r).place.joint is not None
             or law_of(r).place.kind != place
-            or not explained.contains(_Span(linear.residual(r.score.form.columns)))
+            or not explained.contains(Span(linear.residual(r.score.form.columns)))
         )
 
 
@@ -194,11 +205,7 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
     laws, shares, said_by = list[Law](), list[float](), dict[tuple[str, str], frozenset[str]]()
     views = linear.measurement.views
     drivers = list(drivers_of(views))
-    effects = [
-        (c, [_Span(form.columns) for form in c.forms if form.keep.sum() == c.forms[0].keep.sum()])
-        for c in candidates
-        if not c.empirical
-    ]
+    effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
     for place in _places(linear):
         for driver in drivers:
             if driver.joint not in (None, place.joint):
@@ -207,7 +214,7 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
             laws += [law for law, _ in forms]
             shares += [share for _, share in forms]
             whole = [Law(place, driver, shape, place.whole) for shape in driver.shapes]
-            spans = [_Span(law.reduced(linear.observation)) for law in whole]
+            spans = [Span(law.reduced(linear.observation)) for law in whole]
             said = (c.name for c, forms in effects if _says(views, c, forms, place, driver, spans))
             said_by[place.name, driver.name] = frozenset(said)
     return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
@@ -461,7 +468,7 @@ def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Span:
+class Span:
     """What columns (n, p) can say."""
 
     columns: Array
@@ -471,14 +478,20 @@ class _Span:
         """(n, r) orthonormal."""
         return column_space(self.columns)
 
-    def contains(self, other: "_Span") -> bool:
+    def contains(self, other: "Span") -> bool:
         """Return whether the other's columns are combinations of these."""
         left = other.columns - self.basis @ (self.basis.T @ other.columns)
         return bool(other.columns.any() and np.sum(left**2) < (1 - _SAME) * np.sum(other.columns**2))
 
 
+def _whole_forms(candidate: Candidate) -> list[Span]:
+    """Return the forms of an effect with all its parameters."""
+    forms = candidate.forms
+    return [Span(form.columns) for form in forms if form.keep.sum() == forms[0].keep.sum()]
+
+
 def _says(
-    views: Views, candidate: Candidate, whole: Sequence[_Span], place: Place, driver: Driver, laws: Sequence[_Span]
+    views: Views, candidate: Candidate, whole: Sequence[Span], place: Place, driver: Driver, laws: Sequence[Span]
 ) -> bool:
     """Return whether an effect is a law: it acts there and follows that, as it declares or as its columns show."""
     effect = candidate.effect

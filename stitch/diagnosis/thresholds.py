@@ -18,8 +18,6 @@ ODDS = float(np.log(20.0))
 MOST_LAWS = 3
 # Prior shares: nothing is missing, one effect of the library, something without a name (of every kind by itself).
 PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
-# Usual sizes up to which a name may be certain: beyond, something that is stated is likelier to be wrong (custom).
-BELIEVABLE_SIZES = 10.0
 # The share of the laws of the dictionary, alike for each of some two hundred: an effect that was thought of before is
 # some twenty times as likely as one of them (judgement).
 PRIOR_LAWS = 0.3

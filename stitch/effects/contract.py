@@ -20,6 +20,8 @@ from stitch.numerics.units import Amount, format_amount
 from stitch.session.axes import KINDS, Axis
 from stitch.session.measurement import TEMPERATURES, Measurement
 
+# Usual sizes beyond which something that is stated is likelier to be wrong than a parameter so large (custom).
+BELIEVABLE_SIZES = 10.0
 # Stand in a grid for all views of the session, and for all of its temperatures.
 EVERY_VIEW, EVERY_TEMPERATURE = (-1.0,), (-2.0,)
 # Places that are tried for an event among hundreds of views.
@@ -177,6 +179,10 @@ class Parameter:
     def fitted(self) -> bool:
         """True if views showed it, of this session or of the run that its arm comes from."""
         return bool(np.isfinite(self.sigma))
+
+    def beyond_belief(self, value: float, sigma: float) -> bool:
+        """Return whether a value is clearly larger than is believed of the parameter."""
+        return abs(value) - 2 * sigma > min(BELIEVABLE_SIZES * self.typical, self.limit)
 
     @property
     def status(self) -> str:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from stitch.effects.axis_effects import PLACEMENT
 from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in
 from stitch.numerics import frames
+from stitch.numerics.distributions import sigmas_among
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES, value_uncertainty_text
 from stitch.session.measurement import Measurement
@@ -56,8 +57,10 @@ class Term(Value):
 
     @property
     def sigmas_from_zero(self) -> float:
-        """The largest |value|/sigma of its parameters; 0 where the views see none."""
-        return max((abs(p.value) / p.sigma for p in self.parameters if p.fitted and not p.grid), default=0.0)
+        """The largest |value|/sigma of its parameters, for what it is worth among so many; 0 where the views see
+        none."""
+        sigmas = [abs(p.value) / p.sigma for p in self.parameters if p.fitted and not p.grid]
+        return sigmas_among(max(sigmas), len(sigmas)) if sigmas else 0.0
 
     @property
     def values(self) -> Array:

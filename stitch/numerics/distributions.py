@@ -47,6 +47,12 @@ def normal_tail(x: float) -> float:
     return float(special.ndtr(-x))
 
 
+def sigmas_among(sigmas: float, count: int) -> float:
+    """Return how many sigmas the farthest of so many normal numbers is worth, one being asked alone (Bonferroni)."""
+    chance = np.log(max(count, 1)) + float(special.log_ndtr(-sigmas))
+    return float(-special.ndtri_exp(min(chance, np.log(0.5))))
+
+
 def binomial_tail(x: int, count: int, share: float) -> float:
     """P(X > x) of so many trials with a chance each."""
     return float(special.bdtrc(x, count, share))

@@ -177,3 +177,27 @@ def test_an_effect_that_ends_with_nothing_is_taken_out():
     fewer, lines = stepwise._drop_idle(added, set(), None)
     assert not fewer.effects and "gear_harmonic" in fewer.tried and "differs from zero; it was dropped" in lines[0]
     assert stepwise._drop_idle(added, {"gear_harmonic"}, None) == (added, [])
+
+
+def test_an_effect_without_which_views_left_out_are_predicted_better_is_taken_out(monkeypatch):
+    """Of two that were added the one goes that raises the error; a step of matching anew is no reason."""
+    of_effects = {("a",): 0.9, ("b",): 1.1, ("a", "b"): 1.0, (): 1.3}
+
+    def state(names, clouds=False):
+        terms = tuple(SimpleNamespace(name=n, sigmas_from_zero=9.0) for n in names)
+        return SimpleNamespace(
+            terms=terms,
+            effects=names,
+            model=SimpleNamespace(effects=names),
+            heldout_or_fit_rms=of_effects[names],
+            session=SimpleNamespace(has_clouds=clouds),
+            tried={},
+        )
+
+    monkeypatch.setattr(stepwise, "change", lambda run, names, *_: state(tuple(names), run.session.has_clouds))
+    monkeypatch.setattr(stepwise, "replace", lambda run, tried: SimpleNamespace(**vars(run) | {"tried": tried}))
+    fewer, lines = stepwise._drop_idle(state(("a", "b")), set(), None)
+    assert fewer.effects == ("a",) and "without b views left out are predicted better" in lines[0]
+    assert stepwise._drop_idle(state(("a", "b")), {"b"}, None)[0].effects == ("a", "b")
+    of_effects["a",] = 0.97
+    assert stepwise._drop_idle(state(("a", "b"), clouds=True), set(), None)[0].effects == ("a", "b")

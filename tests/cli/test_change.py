@@ -9,7 +9,9 @@ from stitch.cli.change import remarks
 
 def with_effect(sigmas: float, heldout: float) -> SimpleNamespace:
     """A run to which an effect was added that is so many sigmas from zero, and what it left held out (1.0 before)."""
-    parameter = SimpleNamespace(name="a", value=sigmas, sigma=1.0, fitted=True, grid=(), limit=1e3)
+    parameter = SimpleNamespace(
+        name="a", value=sigmas, sigma=1.0, fitted=True, held=False, beyond_belief=lambda value, sigma: False
+    )
     steps = (SimpleNamespace(effects=(), heldout_rms=1.0), SimpleNamespace(effects=("settling",), heldout_rms=heldout))
     return SimpleNamespace(
         ledger=steps,

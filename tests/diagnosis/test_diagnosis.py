@@ -302,3 +302,14 @@ def test_a_covariate_is_no_joint_by_its_name(blade_capture):
     values = {driver.name: driver.values for driver in drivers_of(views)}
     assert np.array_equal(values["jig_deg"], tilt) and np.array_equal(values["j_deg"], 2 * tilt)
     assert np.allclose(values["j2_deg"], np.degrees(measured.plan.joints[:, 1]))
+
+
+def test_of_columns_that_are_one_the_named_effects_own_is_told():
+    """Joints 1 to 3 come from where joint 5 comes, which has play."""
+    side = np.where(np.arange(24) % 2, 1.0, -1.0)
+    session, *_ = labelled_cell(3, views=24, errors=(np.outer(-3e-4 * side, np.eye(6)[4]), np.zeros((24, 6))))
+    approach = np.outer(side, [1.0, 1.0, 1.0, 0.0, 1.0, 0.0])
+    views = tuple(replace(view, approach=row) for view, row in zip(session.views, approach, strict=True))
+    found = diagnose_state(run(replace(session, views=views)))
+    assert found.effects == ("backlash",) and found.depends_on[0].covariate == "j5_approach"
+    assert not [x for x in found.depends_on[1:] if x.covariate.endswith("_approach")]

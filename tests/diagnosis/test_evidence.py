@@ -15,7 +15,7 @@ from stitch.diagnosis.ranking import Ranked, is_certain, rank_all
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.validation import CrossValidation
 from stitch.diagnosis.verdict import Evidence
-from stitch.effects.contract import EFFECTS
+from stitch.effects.contract import EFFECTS, Parameter
 from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.observations.surfaces.field_error import FieldError
@@ -325,3 +325,21 @@ def test_a_jump_that_no_joint_follows_is_one_in_time(third_joint):
     """The joint turns back eight views earlier, or to and fro all the time."""
     found = evidence_of(third_joint)
     assert found.verdict == "missing_effect" and [r.name for r in found.named] == ["part_slip"]
+
+
+def test_of_two_that_are_missing_the_one_of_a_believable_size_is_named():
+    """A gravity of the wrist 60 times as large as usual stands behind an offset that any arm may have."""
+    sized = {}
+    for name, value in (("joint_compliance", 3e-4), ("joint_offset", 1e-3)):
+        parameter = Parameter("x1", "rad", typical=5e-6 if value < 1e-3 else 1e-3)
+        form = SimpleNamespace(free=(parameter,), term=SimpleNamespace(name=name))
+        known = {"values": (value,), "sigmas": (value / 50,), "form": form}
+        one = ranked(name)
+        sized[name] = replace(one, score=SimpleNamespace(**vars(one.score) | known))
+    large, usual = sized.values()
+    found = Evidence((large, usual), (), alarm=True, explanation=(large,), further=usual, together=(large, usual))
+    after = gathering.ask([gathering.is_its_size_believable], NO_CASE, found)
+    assert after.named == (usual,) and after.second is large and after.together == (usual, large)
+    assert "joint_compliance is missing too, but x1 is larger than is believable" in after.notes
+    alone = replace(found, further=None, together=(large,))
+    assert gathering.ask([gathering.is_its_size_believable], NO_CASE, alone).named == (large,)

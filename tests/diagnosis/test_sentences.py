@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stitch.diagnosis.diagnosis import Diagnosis, too_large
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.ranking import too_large
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sentences import diagnosis_sentence, odds_text, scanner_advice, scanner_error_sentence
 from stitch.diagnosis.verdict import Evidence
+from stitch.effects.contract import Parameter
 from stitch.observations.surfaces.field_error import FieldError
 
 
@@ -123,12 +125,12 @@ def test_a_scale_of_the_scanner_may_be_one_of_the_arm(effect, said):
 
 def test_a_size_beyond_belief_is_asked_about_and_not_certain():
     """No size forbids a name: a number in a table may be wrong."""
-    free = [SimpleNamespace(name=name, limit=5.0, unit="mm") for name in ("da1", "da2")]
+    free = [Parameter(name, "mm", typical=0.3, limit=5.0) for name in ("da1", "da2")]
     form = SimpleNamespace(free=free, term=SimpleNamespace(parameters=[]), sizes=np.array([0.3, 0.3]))
     score = SimpleNamespace(fitted=True, form=form, values=np.array([0.1, -8.0]), sigmas=np.array([0.02, 0.02]))
     told = said_at(1e9, "missing_effect", "link_geometry", score=score)
     assert "da2 = -8 ± 0.02 mm" in told
-    assert told.endswith(" da2 is more than 10 times the usual size: check session.toml.")
+    assert told.endswith(" da2 is larger than is believable: check session.toml.")
     assert told.startswith("link_geometry may be missing") and "odds" not in told
 
 

@@ -25,6 +25,18 @@ def test_tails_and_limits_are_those_of_scipy_stats(p, degrees):
     assert distributions.f_tail(9.0, degrees, 17) == pytest.approx(stats.f.sf(9.0, degrees, 17), rel=1e-10)
 
 
+@pytest.mark.parametrize("sigmas", [0.3, 2.7, 12.0, 60.0])
+def test_the_farthest_of_many_is_worth_what_one_of_its_chance_is(sigmas):
+    assert distributions.sigmas_among(sigmas, 1) == pytest.approx(sigmas, rel=1e-9)
+    chance = 14 * stats.norm.sf(sigmas)
+    worth = distributions.sigmas_among(sigmas, 14)
+    assert (
+        worth == 0.0
+        if chance > 0.5
+        else stats.norm.logsf(worth) == pytest.approx(np.log(14) + stats.norm.logsf(sigmas), rel=1e-9)
+    )
+
+
 @pytest.mark.parametrize("shift", [0.5, 20.0])
 def test_noncentral_tails_are_those_of_scipy_stats(shift):
     assert distributions.noncentral_f_tail(4.0, 2, 60, shift) == pytest.approx(

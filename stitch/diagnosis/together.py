@@ -1,0 +1,206 @@
+"""What several sessions of one arm decide together: which of its errors is missing, where each alone cannot tell.
+
+Over one sweep of two joints a gear that runs out of true, gravity and a fixture that droops are one curve. Under
+another load gravity's part grows and the gear's does not. So the numbers of an effect of the arm are the same in all
+sessions, and its evidence is that of the sums of what the sessions say of them. Held against it: that every session
+has numbers of its own, of another effect or of a law of the dictionary, and errors without a name. What begins at some
+view, and time constants, are a session's own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from stitch.diagnosis import thresholds as limits
+from stitch.diagnosis.candidates import Candidate, candidates_of
+from stitch.diagnosis.ranking import rank_all
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import Score, form_weights
+from stitch.diagnosis.sentences import odds_text
+from stitch.diagnosis.systematic_laws import dictionary_of, law_of, rank_laws
+from stitch.diagnosis.unmodelled_time_effects import least_log_bayes_factor
+from stitch.diagnosis.verdict import Verdict
+from stitch.effects.contract import Parameter
+from stitch.model.model import ARM_PLACES
+from stitch.numerics.frames import Array
+from stitch.numerics.parameter_selection import log_evidence_at_scales, log_mixture
+from stitch.numerics.reml import at_variances
+from stitch.observations.linear_model import LinearModel
+
+# Parameters of a name that are told.
+_LISTED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """An effect of the arm with the same numbers in all sessions, by its likeliest form."""
+
+    name: str
+    log_bayes_factor: float
+    log_posterior: float  # not normalised
+    parameters: tuple[Parameter, ...] = ()  # that are free, with values and sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """What sessions of one arm decide together."""
+
+    verdict: Verdict  # missing_effect, cannot_tell, or unknown_effect where something else does as well
+    effects: tuple[str, ...]  # the name, or the group that the sessions do not tell apart
+    candidates: tuple[Shared, ...]  # likeliest first
+    otherwise: str  # the likeliest of what each session has numbers of its own of
+    log_odds_otherwise: float  # of the likeliest candidate over that
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds of the likeliest candidate over the next, or over nothing being missing."""
+        first, *others = self.candidates
+        return first.log_posterior - max([float(np.log(limits.PRIOR_NOTHING)), *(c.log_posterior for c in others)])
+
+
+def decide_together(linears: Sequence[LinearModel]) -> Together:
+    """Return which effect of their arm several sessions show, each linearised about a model without it."""
+    tried = [candidates_of(linear, empirical=False)[0] for linear in linears]
+    ranked = [rank_all(linear, candidates)[0] for linear, candidates in zip(linears, tried, strict=True)]
+    by_name = [{r.name: r for r in of_session} for of_session in ranked]
+    common = [name for name in by_name[0] if all(name in of_session for of_session in by_name)]
+    names = [name for name in common if any(of_session[name].score.observable for of_session in by_name)]
+    scores = {name: [of_session[name].score for of_session in by_name] for name in names}
+    otherwise = _each_its_own(linears, tried, scores)
+    shared = [_shared(linears, of, len(names)) for of in scores.values() if _is_shared(of[0].candidate)]
+    # Numbers of its own in every session are no rival of the same effect: its name holds.
+    own = {s.name: otherwise.pop(s.name) for s in shared}
+    shared = [
+        s if np.isinf(s.log_posterior) else replace(s, log_posterior=max(s.log_posterior, own[s.name])) for s in shared
+    ]
+    shared.sort(key=lambda s: -s.log_posterior)
+    rival = max(otherwise, key=lambda name: otherwise[name], default="")
+    least = float(np.log(limits.PRIOR_NOTHING)) + limits.ODDS
+    if not shared or shared[0].log_posterior < least:
+        alone = any(value > least for value in otherwise.values())
+        return Together("unknown_effect" if alone else "adequate", (), tuple(shared), rival, -np.inf)
+    best = shared[0]
+    odds = best.log_posterior - otherwise.get(rival, -np.inf)
+    near = tuple(s.name for s in shared if s.log_posterior > best.log_posterior - limits.ODDS)
+    by_session = zip(linears, scores[best.name], strict=True)
+    beside = sum(least_log_bayes_factor(linear, scored) for linear, scored in by_session)
+    if odds < limits.ODDS or beside < limits.ODDS:
+        return Together("unknown_effect", (), tuple(shared), rival, odds)
+    return Together("missing_effect" if len(near) == 1 else "cannot_tell", near, tuple(shared), rival, odds)
+
+
+def together_sentence(together: Together) -> str:
+    """Return what the sessions say, by what it was decided."""
+    match together.verdict:
+        case "adequate":
+            return "they show no effect of their arm."
+        case "unknown_effect":
+            return f"no effect of the arm alone is it: {together.otherwise} in each session by itself explains as much."
+        case "cannot_tell":
+            return f"something of the arm is missing: {' or '.join(together.effects)}. They do not tell which."
+    best = together.candidates[0]
+    clear = sorted(best.parameters, key=lambda p: -abs(p.value) / p.sigma)[:_LISTED]
+    amounts = ", ".join(f"{p.name} = {p.formatted}" for p in clear)
+    over = f"the next of the arm {odds_text(together.log_odds)}"
+    if together.otherwise:
+        over += f", over {together.otherwise} in each session by itself {odds_text(together.log_odds_otherwise)}"
+    return f"{best.name} is missing ({amounts}); the odds over {over}."
+
+
+def together_document(together: Together, sessions: Sequence[str]) -> dict[str, Any]:
+    """Return it for --json."""
+    return {
+        "format": "stitch-together/1",
+        "sessions": list(sessions),
+        "verdict": together.verdict,
+        "effects": list(together.effects),
+        "sentence": together_sentence(together),
+        "candidates": [
+            {
+                "name": c.name,
+                "log_posterior": c.log_posterior,
+                "parameters": {p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} for p in c.parameters},
+            }
+            for c in together.candidates
+        ],
+    }
+
+
+def _is_shared(candidate: Candidate) -> bool:
+    return candidate.effect.place in ARM_PLACES and not candidate.forms[0].term.gridded.any()
+
+
+def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int) -> Shared:
+    """Return one effect with common numbers: each session at the scatter that is left beside the effect there."""
+    parts = []
+    for linear, scored in zip(linears, scores, strict=True):
+        variances = linear.null.variances if scored.variances is None else scored.variances
+        at = replace(linear, null=at_variances(linear.mixed, variances))
+        whole = scored.candidate.forms[0]
+        ((information, vector),) = at.information([whole.selected])
+        parts.append((whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance)))
+    known = {p.name: p for free, *_ in parts for p in free}
+    number = {name: k for k, name in enumerate(known)}
+    total, towards = np.zeros((len(known), len(known))), np.zeros(len(known))
+    for free, information, vector, _ in parts:
+        at_numbers = [number[p.name] for p in free]
+        total[np.ix_(at_numbers, at_numbers)] += information
+        towards[at_numbers] += vector
+    sizes = np.array([p.typical for p in known.values()])
+    scales = regime_of(linears[0]).scales
+    longest = max((scored.candidate for scored in scores), key=lambda c: len(c.forms[0].free))
+    gains = []
+    for form in longest.forms:
+        index = np.array([number[p.name] for p in form.free])
+        both = total[np.ix_(index, index)] * np.outer(sizes[index], sizes[index])
+        gains.append(log_mixture(log_evidence_at_scales(both, towards[index] * sizes[index], scales), scales))
+    gained = float(logsumexp(np.array(gains) + np.log(form_weights(longest)))) + sum(part[-1] for part in parts)
+    prior = float(np.log(limits.PRIOR_PHYSICAL * longest.effect.prior / tests))
+    index = np.array([number[p.name] for p in longest.forms[int(np.argmax(gains))].free])
+    fitted = _fitted([list(known.values())[k] for k in index], total[np.ix_(index, index)], towards[index])
+    if not _grows_with_load(fitted):
+        return Shared(longest.name, -np.inf, -np.inf, fitted)
+    return Shared(longest.name, gained, gained + prior, fitted)
+
+
+def _fitted(free: Sequence[Parameter], information: Array, vector: Array) -> tuple[Parameter, ...]:
+    """Return parameters with values and sigmas; what is not seen is of usual size."""
+    sizes = np.array([p.typical for p in free])
+    covariance = np.linalg.inv(information + np.diag((limits.FREE_SIZES * sizes) ** -2.0))
+    values, sigmas = covariance @ vector, np.sqrt(np.diag(covariance))
+    return tuple(replace(p, value=v, sigma=s) for p, v, s in zip(free, values.tolist(), sigmas.tolist(), strict=True))
+
+
+def _each_its_own(
+    linears: Sequence[LinearModel], tried: Sequence[Sequence[Candidate]], scores: dict[str, list[Score]]
+) -> dict[str, float]:
+    """Return the log posteriors of effects and laws of which every session has numbers of its own."""
+    found = dict[str, float]()
+    for name, of in scores.items():
+        prior = float(np.log(limits.PRIOR_PHYSICAL * of[0].candidate.effect.prior / len(scores)))
+        found[name] = sum(scored.log_bayes_factor for scored in of) + prior
+    laws = []
+    for linear, candidates in zip(linears, tried, strict=True):
+        dictionary = dictionary_of(linear, candidates)
+        likeliest = [r for r in rank_laws(linear, dictionary) if not dictionary.said_by[law_of(r).key]]
+        laws.append({law_of(r).key: r for r in likeliest})
+    for key, first in laws[0].items():
+        if all(key in of_session for of_session in laws):
+            others = sum(of_session[key].score.log_bayes_factor for of_session in laws[1:])
+            found[law_of(first).words] = first.log_posterior + others
+    return found
+
+
+def _grows_with_load(parameters: Sequence[Parameter]) -> bool:
+    """Return False where a known load that bends an arm as usual would be seen, and bends nothing.
+
+    The masses of links are parts of their coefficients: without a load gravity is any curve.
+    """
+    known = [p for p in parameters if not p.unit.startswith("kg ")]
+    if len(known) == len(parameters):
+        return True
+    shown = [p for p in known if 2 * p.sigma < p.typical]
+    return not shown or any(p.value > limits.FAINT_SIGMAS * p.sigma for p in known)
