@@ -2,9 +2,13 @@
 the hand-eye is off.
 
 Kinematics, errors and sightings are written down here; of the library only the session, its check and the run are used.
+
+MEASURED: measured sessions of the shared data, before and after `add --suggested`; of half the poses of the IRB 120,
+what its arm leaves in the other half. Idle: no parameter differs from zero by two sigmas, for what that is worth.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +16,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench.harness import Row, Table, grouped, markdown, share
+from bench.harness import SHARED_DATA, Row, Table, grouped, markdown, share
 from stitch import NoResultError, run
+from stitch.api.stepwise import suggest
+from stitch.model.model_toml import arm_model
 from stitch.numerics.frames import Array
+from stitch.output.result_document import model_of
 from stitch.screening.deep_check import deep_check
+from stitch.session.reading.session_folder import load_session
 from stitch.session.session import Mount, Scanner, SessionData, Sighting, View
 
 NOISE = 0.05  # mm, of a coordinate that the sensor shows
@@ -35,6 +43,7 @@ WORLDS: dict[str, tuple[str, list[tuple[float, float, float]], tuple[float, floa
     "gantry": ("XYZzy", [(0, 0, 0), (0, 0, 0), (0, 0, 900), (0, 0, -50), (0, 0, -80)], (1e-3, 2e-3, 0.5, 5e-5, 0.3)),
 }  # fmt: skip
 TIMES = (0.0, 0.5, 2.0, 8.0)
+_FAINT = 2.0
 _BALLS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0], [10.0, 5.0, 95.0]])
 
 
@@ -200,3 +209,52 @@ def bad_jobs(seeds: range, **_: Any) -> Iterator[Row]:
 
 TURNING = Table(turning_jobs, turning, turning_summary, range(100, 120), page="points", block="turning")
 BAD_ARMS = Table(bad_jobs, bad_arm, bad_summary, range(100, 120), page="points", block="bad-arms")
+
+
+def measured_jobs(seeds: range, **_: Any) -> Iterator[Row]:
+    """The sets, of the IRB 120 also the even poses and the odd ones."""
+    names = [f"reghec/{name}" for name in ("cone", "david", "gripperopen", "rubik", "sphere")]
+    names += ["irb120-tracker", "irb120-tracker, even", "irb120-tracker, odd", "ur10-tmac-C", "ur10-tmac-A"]
+    yield from ({"set": name} for name in names)
+
+
+def measured(job: Row) -> Row:
+    """What `add --suggested` makes of one set, and of the other half of its poses."""
+    folder, _, half = job["set"].partition(", ")
+    session = load_session(SHARED_DATA / folder)
+    parts = [_every_second(session, first) for first in ((0, 1) if half == "even" else (1, 0))]
+    state = run(parts[0] if half else session)
+    found, *_ = suggest(state, 5)
+    final = found or state
+    fitted = [(t, p) for t in final.terms for p in t.parameters if p.fitted and not p.grid and not t.is_geometry]
+    row = {
+        "before": state.heldout_or_fit_rms,
+        "after": final.heldout_or_fit_rms,
+        "effects": list(final.effects),
+        "idle": [t.name for t in final.terms if t.sigmas_from_zero < _FAINT],
+        "large": sorted({f"{t.name} {p.name}" for t, p in fitted if p.beyond_belief(p.value, p.sigma)}),
+    }
+    arm = arm_model(model_of(final))
+    if half:
+        row |= {"nominal": run(parts[1]).residual_rms, "other": run(parts[1], arm=arm).residual_rms}
+    return row
+
+
+def _every_second(session: SessionData, first: int) -> SessionData:
+    """Return the sightings of every second view; the others say from where the arm came."""
+    views = (v if k % 2 == first else replace(v, sighting=None) for k, v in enumerate(session.views))
+    return replace(session, views=tuple(views))
+
+
+def measured_summary(rows: list[Row]) -> list[str]:
+    """A line a set."""
+    lines = []
+    for r in rows:
+        other = f"{r['nominal']:.3f} → {r['other']:.3f}" if "other" in r else ""
+        effects, idle, large = (", ".join(r[key]) or "–" for key in ("effects", "idle", "large"))
+        lines.append((r["set"], f"{r['before']:.3f}", f"{r['after']:.3f}", effects, idle, large, other))
+    head = "set | left out, nominal, mm | with what is suggested | added | idle | ten usual sizes and more, uncertain"
+    return markdown(f"{head} | other half: nominal → with its arm", lines)
+
+
+MEASURED = Table(measured_jobs, measured, measured_summary, range(1), page="points", block="measured")

@@ -43,6 +43,7 @@ TABLES = {
     "large": "speed:LARGE",
     "laws-everywhere": "laws_everywhere:TABLE",
     "loads": "points:LOADS",
+    "measured-sets": "real_arms:MEASURED",
     "mistakes": "integrity:MISTAKES",
     "mistakes-in-many-views": "integrity:MANY",
     "mistakes-in-measured-scans": "integrity:MEASURED",
