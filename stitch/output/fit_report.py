@@ -1,6 +1,6 @@
 """A run as one block of text: what was found, how well, what is in the model and what is not."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from textwrap import wrap
 
 import numpy as np
@@ -64,7 +64,16 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
     if not run.session.has_poses:
         axis = run.session.reference_frame
         lines[0] = lines[0].replace("T_base", f"T_{axis}").replace("frame of the base", f"frame of axis {axis}")
-    return lines
+    return lines + _guessed_lines(run.session.usual)
+
+
+def _guessed_lines(usual: Mapping[str, str]) -> list[str]:
+    """Return what the numbers above rest on that is only usual."""
+    of = {"length_unit": "the poses", "cloud_unit": "the clouds"}
+    units = [f"{of[what]} are in {value}" for what, value in usual.items() if what in of]
+    others = [f"{what} {value}" for what, value in usual.items() if what not in of]
+    lines = [f"  ? scale not known: lengths hold if {' and '.join(units)}, as is usual"] if units else []
+    return lines + ([f"  ? guessed, shown by neither files nor scans: {', '.join(others)}"] if others else [])
 
 
 def axis_lines(run: RunData) -> list[str]:

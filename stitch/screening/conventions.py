@@ -52,6 +52,8 @@ _OF_ONE_ROW = ("inverse", "quaternion", "euler", "degrees")
 _ONE_VALUE = 1e-6
 # Of its length: how near the direction and the factor of a linear axis are to what they are taken for.
 _AXIS_NEAR = 0.05
+# Shares of a step by which poses may lag; angles that are off by so many times what closes say no more.
+_LAGS, _LAG_OFF = np.linspace(0.02, 0.6, 30), 4.0
 
 
 def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices | None = None) -> list[MotionFit]:
@@ -73,7 +75,7 @@ def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices 
         if not session.axes:
             tried += _with_stuck_columns_restored(as_stated, motions, length)
             tried += _on_linear_axis(session, every, as_stated, motions)
-        tried += _between_rows(stated, motions, length)
+        tried += [*_between_rows(stated, motions, length), *lagging_poses(stated, motions)]
         tried += _by_table_part(tried, motions, [session.names[v] for v in every])
         fits += fit_hypotheses(tried, motions, session.length_unit)[1:]
     # A scale that leaves nothing of the positions closes as well as what explains them.
@@ -245,6 +247,38 @@ def _between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> 
         along_lines = fit_positions(R, middles, stated.mount, motions, used, X[:3, :3])
         for poses in (by_screws, frames.make(R, along_lines)):
             yield replace(stated.undone("between rows", poses, where=where, neighbour=neighbour), used=used)
+
+
+def lagging_poses(stated: Hypothesis, motions: RelativeScans) -> Iterator[Hypothesis]:
+    """Yield the poses of which those stated lag by one share of each step, along screws and along lines.
+
+    The share is the one under which the flange turns by the scanner's angles.
+    """
+    T = stated.T_base_flange
+    v, w = np.array(motions.pairs).T
+    shares = _LAGS
+    for width in (0.0, _LAGS[1] - _LAGS[0]):
+        shares = np.clip(shares + np.linspace(-width, width, len(_LAGS)), 0, _LAGS[-1])
+        ahead = _without_lag(T, shares, along_lines=False)
+        turned = rotation_angles((frames.inverse(ahead[:, v]) @ ahead[:, w]).reshape(-1, 4, 4)).reshape(len(shares), -1)
+        off = np.abs(turned - rotation_angles(motions.T)).clip(max=_LAG_OFF * ROTATION).mean(axis=1)
+        shares = np.full(len(_LAGS), shares[np.argmin(off)])
+    if shares[0] > _LAGS[0]:
+        for along_lines in (False, True):
+            poses = _without_lag(T, shares[:1], along_lines)[0]
+            yield stated.undone("lagging", poses, share=float(shares[0]))
+
+
+def _without_lag(T: Array, shares: Array, along_lines: bool) -> Array:
+    """Return (S, V, 4, 4): each pose as far ahead of that stated as this lags, for S shares."""
+    out = [np.tile(T[0], (len(shares), 1, 1))]
+    for pose in T[1:]:
+        last = out[-1]
+        ahead = last @ frames.exp(frames.log(frames.inverse(last) @ pose) / (1 - shares)[:, None])
+        if along_lines:
+            ahead[:, :3, 3] = last[:, :3, 3] + (pose[:3, 3] - last[:, :3, 3]) / (1 - shares)[:, None]
+        out.append(ahead)
+    return np.stack(out, axis=1)
 
 
 def _positions_of_middles(middle: Array, ahead: int) -> tuple[Array, Array]:

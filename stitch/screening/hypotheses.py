@@ -39,6 +39,8 @@ MISTAKES: dict[str, dict[str, str]] = {
         "by number",
         "between rows": "every pose stands half a row {where} its scan: midway between the poses of this scan and the "
         "{neighbour} one, as if it had been interpolated to another time: pair scans and poses by their own times",
+        "lagging": "every pose lags its scan by {share:.0%} of the way from the one before; to fix: record each pose "
+        "once the arm stands still",
     },
     "reversed": {
         "reversed": "the poses are in reverse order; to fix: turn the list around",
@@ -86,8 +88,8 @@ MISTAKES: dict[str, dict[str, str]] = {
     # By another factor; or rotations turn as the scanner did, and positions do not follow.
     "scale": {
         "factor": "the clouds are {factor} times as large as the robot's motions; to fix: check the scale of both",
-        "no factor": "The robot's positions do not explain how the scanner moved; its rotations do; to fix: is an "
-        "axis missing (column E1), or a column mixed up?",
+        "no factor": "The robot's positions do not explain how the scanner moved; its rotations do; to fix: "
+        "export the positions again",
         "scaled cloud": "this cloud is {factor:.4g} times as large as the part; to fix: multiply it by {by:.5g}",
         "stuck column": "{axis} of the positions is {value:.6g} in all rows, and the scans show that it changes; to "
         "fix: export the poses again, with this column",

@@ -167,6 +167,7 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
     repeatability: StatedRepeatability = field(default_factory=StatedRepeatability)
     axes: tuple[Axis, ...] = ()  # in the order of the chain
     has_poses: bool = True  # False: axes alone move what is scanned
+    usual: dict[str, str] = field(default_factory=dict, compare=False)  # what was only guessed when it was made
 
     @property
     def reference_frame(self) -> str:

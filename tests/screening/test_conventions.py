@@ -194,8 +194,8 @@ def test_an_impossible_factor_is_not_printed(scale):
     said = scale_text(scale)
     assert f"{scale:.5g} times" not in said
     assert said == (
-        "The robot's positions do not explain how the scanner moved; its rotations do; to fix: is an axis missing "
-        "(column E1), or a column mixed up?"
+        "The robot's positions do not explain how the scanner moved; its rotations do; to fix: export "
+        "the positions again"
     )
 
 

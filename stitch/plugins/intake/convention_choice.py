@@ -223,14 +223,15 @@ def choose_by_surfaces(capture: Capture, readings: Sequence[Reading], like: Inte
     return _choose_interpretation(capture, ways, None)
 
 
-def fitted_scale(motions: RelativeScans, decided: ConventionChoice, sizes: Sequence[float] = (1.0,)) -> float | None:
+def fitted_scale(
+    motions: RelativeScans, ways: Sequence[Interpretation], sizes: Sequence[float] = (1.0,)
+) -> float | None:
     """Return how many times larger than the robot's motions the scans are; None where the motions do not tell it.
 
     Args:
         sizes: of the scans against the robot's motions, from which the factor is fitted.
     """
-    interpretation = decided.best.interpretation
-    tried = [replace(interpretation, carries=carries).hypothesis(i) for i, carries in enumerate((True, False))]
+    tried = [way.hypothesis(i) for i, way in enumerate(ways)]
     found = []
     for size in sizes:
         # What a motion may leave open is stated for scans of the true size.

@@ -4,13 +4,14 @@ What a person states is taken; what the files tell is read; the rest is decided 
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing, pairings, stated_pairing
 from stitch.plugins.intake.convention_choice import (
@@ -26,7 +27,8 @@ from stitch.plugins.intake.convention_choice import (
     weigh_doubts,
 )
 from stitch.plugins.intake.folder_files import FolderFiles, angles_in_names, find_folder_files
-from stitch.plugins.intake.guesses import Guess
+from stitch.plugins.intake.guesses import Because, Guess
+from stitch.plugins.intake.inventory import several_lists
 from stitch.plugins.intake.layouts import (
     CLOUD_UNITS,
     MM,
@@ -46,6 +48,7 @@ from stitch.plugins.intake.readings import (
     left_handed_readings,
     mixed_readings,
     with_joints_of,
+    with_uncoupled_joints,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change, state
 from stitch.plugins.intake.scan_targets import find_folder_targets, target_motions
@@ -66,6 +69,8 @@ from stitch.system.process import steps
 # Enough points a view to tell conventions.
 _POINTS = 8000
 _FEWEST = 3
+# Lists that are tried where the scans contradict the likely one.
+_MOST_LISTS = 4
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,24 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
     """
     found = find_folder_files(folder, stated.poses, stated.accepts)
+    if found.alike == 1:
+        first = _session_of(found, stated)
+        if first.choice.determined or len(found.rivals) < 2:
+            return first
+    made = list[FirstSession]()
+    for rival in found.rivals[: found.alike if found.alike > 1 else _MOST_LISTS]:
+        with suppress(InputError, NoResultError):
+            made.append(_session_of(replace(found, chosen=rival), stated))
+    told = [other for other in made if other.choice.determined]
+    if len(told) == 1:
+        return told[0]
+    if found.alike > 1:
+        raise several_lists(folder, found.rivals[: found.alike])
+    return first
+
+
+def _session_of(found: FolderFiles, stated: StatedFolder) -> FirstSession:
+    """Return the session of clouds and the one list of poses that was chosen."""
     raw = _read_table(found, stated)
     clouds, kept, lost = _read_clouds(found.clouds, stated.box)
     if stated.rows:
@@ -104,7 +127,7 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     else:
         ways_to_pair = pairings(found.clouds, raw.labels, raw.numbers)
     pairs = [pairing.of(kept, raw.without_pose) for pairing in ways_to_pair]
-    found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
+    every, found = found, replace(found, clouds=tuple(found.clouds[i] for i in kept))
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
     ways_to_read = all_readings(raw, found.urdf, stated)
@@ -118,9 +141,10 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     decided, scale = _decide(
         found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
     )
+    decided = _uncoupled(decided, found.urdf)
     alike = _units_of_scale(scale, decided, points, own_units[0], stated)
     if alike and alike[0] != (decided.best.interpretation.length_unit, own_units[0]):
-        again = first_session(folder, replace(stated, length_unit=alike[0][0], cloud_unit=alike[0][1]))
+        again = _session_of(every, replace(stated, length_unit=alike[0][0], cloud_unit=alike[0][1]))
         return replace(again, guesses=tuple(_unit_of_pairs(guess, alike, stated) for guess in again.guesses))
     require_scale(found, scale, stated)
     axis, axis_guess = guess_optical_axis(clouds)
@@ -194,21 +218,28 @@ def _decide(
     if not decided.determined and len(pairs[0].used) == len(found.clouds):
         ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
         require_no_change(found.clouds, motions(), ways)
-    scale = None if decided.determined else fitted_scale(motions(), decided)
-    if scale is not None and abs(np.log(scale)) >= _SCALE and _is_between_units(scale):
-        return decided, scale
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
     if not decided.determined:
         doubted += [*mixed_readings(raw, stated), *left_handed_readings(raw, stated)]
+        unit = decided.best.interpretation.length_unit
+        ways = all_interpretations([*ways_to_read, *doubted], pairs, [unit], (True, False))
+        depth = found.clouds[0].suffix.lower() in DEPTH_SUFFIXES
+        # Where counts are far too large or small the motions close less well.
+        scale = fitted_scale(motions(), ways, (1.0, 10.0, 0.1) if depth else (1.0,))
+        if scale is not None and abs(np.log(scale)) >= _SCALE and (depth or _is_between_units(scale)):
+            return decided, scale
     if doubted and not decided.determined:
         decided = weigh_doubts(decided, choose(doubted))
     elif doubted and not (layout.sure or stated.rotation):
         decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
-    if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
-        # Where counts are far too large or small the motions close less well.
-        return decided, fitted_scale(motions(), decided, (10.0, 0.1))
     return decided, None
+
+
+def _uncoupled(decided: ConventionChoice, urdf: Path | None) -> ConventionChoice:
+    way = decided.best.interpretation
+    way = replace(way, reading=with_uncoupled_joints(way.reading, urdf))
+    return replace(decided, best=replace(decided.best, interpretation=way))
 
 
 def _units_of_scale(
@@ -239,8 +270,9 @@ def _unit_of_pairs(guess: Guess, alike: Sequence[tuple[str, str]], stated: State
     reason += "; only the usual size of a cell tells it from others" if others else ""
     name = ("unit", "cloud_unit")[side]
     states, rival = ({name: pair[side]} for pair in (alike[0], alike[-1]))
+    by: Because = "scans" if (stated.cloud_unit, stated.length_unit)[side] else "usual"
     return replace(
-        guess, reason=reason, determined=not others, runner_up=others or None, by="usual", states=states, other=rival
+        guess, reason=reason, determined=not others, runner_up=others or None, by=by, states=states, other=rival
     )
 
 

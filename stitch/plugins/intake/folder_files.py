@@ -14,7 +14,7 @@ import numpy as np
 from natsort import natsorted, ns
 
 from stitch.errors import InputError
-from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory
+from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory, with_chosen
 from stitch.plugins.intake.raw_poses import ARRAYS, RawPoses, read_by_its_program, read_lists, read_raw_poses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
@@ -85,11 +85,34 @@ class FolderFiles:
 
     folder: Path
     clouds: tuple[Path, ...]
-    poses: tuple[Path, ...]  # one table, or a file for each pose; none: they stand in the headers of the scans
     urdf: Path | None
-    unused: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
-    raw: RawPoses | None = None  # the rows of the poses; None: they stand in the headers of the scans
-    inventory: tuple[FoundList, ...] = ()  # every list of numbers beside the scans
+    others: tuple[Path, ...] = ()  # clouds of another kind
+    lists: tuple[FoundList, ...] = ()  # every list of numbers beside the scans
+    rivals: tuple[FoundList, ...] = ()  # those that serve the clouds, the likely one first
+    alike: int = 1  # the first so many of them, which nothing but the scans can tell from each other
+    chosen: FoundList | None = None  # None: the poses stand in the headers of the scans
+
+    @property
+    def poses(self) -> tuple[Path, ...]:
+        """One table, or a file for each pose."""
+        return self.chosen.files if self.chosen else ()
+
+    @property
+    def raw(self) -> RawPoses | None:
+        """The rows of the poses."""
+        return self.chosen.raw if self.chosen else None
+
+    @property
+    def inventory(self) -> tuple[FoundList, ...]:
+        """Every list, that of the poses first, and what became of the others."""
+        return with_chosen(self.lists, self.chosen) if self.chosen else self.lists
+
+    @property
+    def unused(self) -> tuple[Path, ...]:
+        """Clouds of another kind and other files of poses."""
+        used = (*self.poses, *_lenses(self.clouds))
+        aside = (*self.others, *(f for found in self.lists for f in found.files))
+        return tuple(dict.fromkeys(f for f in aside if f not in used))
 
 
 @readable()
@@ -120,26 +143,24 @@ def find_folder_files(
     texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
     taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
-    chosen: FoundList | None = None
+    open_, alike = list[FoundList](), 1
     inventory: list[FoundList] = []
     if file is not None:
-        chosen = _stated_list(file, part, taken)
-        inventory = [chosen]
+        inventory = open_ = [_stated_list(file, part, taken)]
     elif candidates or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
         inventory = take_inventory(candidates, accepts)
         if inventory or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
-            chosen, inventory = choose_list(folder, inventory, clouds)
+            open_, alike = choose_list(folder, inventory, clouds)
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
-    used = (*(chosen.files if chosen else ()), *_lenses(clouds))
-    aside = (*other_clouds, *(f for found in inventory for f in found.files))
     return FolderFiles(
         folder=folder,
         clouds=tuple(clouds),
-        poses=chosen.files if chosen else (),
         urdf=urdfs[0] if len(urdfs) == 1 else None,
-        unused=tuple(dict.fromkeys(f for f in aside if f not in used)),
-        raw=chosen.raw if chosen else None,
-        inventory=tuple(inventory),
+        others=tuple(other_clouds),
+        lists=tuple(inventory),
+        rivals=tuple(open_),
+        alike=alike,
+        chosen=open_[0] if open_ else None,
     )
 
 

@@ -38,7 +38,7 @@ class FoundList:
     @property
     def name(self) -> str:
         """As --poses takes it: FILE, or FILE#LIST."""
-        part = self.raw.part if self.raw is not None else ""
+        part = _part(self)
         ends = " … ".join(file.name for file in dict.fromkeys((self.files[0], self.files[-1])))
         count = f" ({len(self.files)} files)" if len(self.files) > 1 else ""
         return f"{ends}#{part}" if part else f"{ends}{count}"
@@ -127,11 +127,11 @@ def _reason(error: Exception, file: Path) -> str:
 
 def choose_list(
     folder: Path, inventory: Sequence[FoundList], clouds: Sequence[Path]
-) -> tuple[FoundList, list[FoundList]]:
-    """Return the list of the robot's poses, and the inventory with what became of every other list.
+) -> tuple[list[FoundList], int]:
+    """Return the lists that serve as many clouds, the likely one first, and how many of them rank as it does.
 
     Raises:
-        InputError: no list that can be poses, or several that serve as many clouds; shows the inventory.
+        InputError: no list that can be poses; shows the inventory.
     """
     open_ = [found for found in inventory if found.raw is not None and not found.why_not]
     rows = [found for found in inventory if found.raw is not None]
@@ -145,21 +145,39 @@ def choose_list(
         words = "name the file of the poses with --poses FILE, or a list of it with --poses FILE#LIST, and its columns "
         named = Fix(f"{words}with --columns x,y,z,rx,ry,rz", {"poses": "FILE#LIST", "columns": "COLUMNS"})
         raise Refusal(f"{folder}: no list of poses there{_shown(inventory)}", named)
-    ranked = sorted(open_, key=lambda found: _rank(found, clouds))
-    best = [found for found in ranked if _rank(found, clouds) == _rank(ranked[0], clouds)]
-    if len(best) > 1 and not all(found.files == best[0].files for found in best):
-        names = ", ".join(found.name for found in best[:4])
-        raise Refusal(
-            f"{folder}: several files may hold the poses ({names}){_shown(inventory)}",
-            *(Fix(f"name it with --poses {found.files[0]}", {"poses": str(found.files[0])}) for found in best[:4]),
-        )
-    chosen = replace(ranked[0], taken_for="poses", why_not="")
+    ranked: dict[bytes, tuple[Any, FoundList]] = {}
+    for rank, found in sorted(((_rank(found, clouds), found) for found in open_), key=lambda one: one[0]):
+        assert found.raw is not None
+        ranked.setdefault(found.raw.numbers.tobytes(), (rank, found))  # copies are no rivals
+    ranks = [rank for rank, _ in ranked.values()]
+    return [found for rank, found in ranked.values() if rank[0] == ranks[0][0]], ranks.count(ranks[0])
+
+
+def with_chosen(inventory: Sequence[FoundList], chosen: FoundList) -> tuple[FoundList, ...]:
+    """Return the inventory, the chosen list first, with what became of every other one."""
     others = [
         replace(found, why_not=found.why_not or f"{chosen.name} serves the clouds")
         for found in inventory
-        if found is not ranked[0]
+        if found is not chosen
     ]
-    return chosen, [chosen, *others]
+    return (replace(chosen, taken_for="poses", why_not=""), *others)
+
+
+def several_lists(folder: Path, rivals: Sequence[FoundList]) -> Refusal:
+    """Return the question which of several lists holds the poses, with their rows shown."""
+    names = [f"{found.files[0]}#{part}" if (part := _part(found)) else str(found.files[0]) for found in rivals]
+    told = f"{folder}: several lists may hold the poses, and the scans do not tell which{_shown(rivals)}"
+    return Refusal(
+        told,
+        *(
+            Fix(f"name it with --poses {name}", {"poses": name}, shows=found.raw.shown if found.raw else ())
+            for name, found in zip(names, rivals, strict=True)
+        ),
+    )
+
+
+def _part(found: FoundList) -> str:
+    return found.raw.part if found.raw is not None else ""
 
 
 def _rank(found: FoundList, clouds: Sequence[Path]) -> tuple[int, bool, bool, bool]:

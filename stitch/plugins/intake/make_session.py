@@ -125,7 +125,8 @@ def _require_fit(folder: Path, first: FirstSession, company: Company) -> None:
             found = [str(error).replace(draft, str(folder))]
     if found:
         what, _, advice = found[0].partition("; to fix: ")
-        known = Fix("state --rotation where it is known all the same", {"rotation": "ROTATION"})
+        states = {"rotation": choice.best.interpretation.reading.rotation}
+        known = Fix(f"write it all the same with --rotation {states['rotation']}", states)
         told = f"{folder}: no session was written, as no reading of the poses fits the scans. {what}"
         raise Refusal(told, *([change(folder, advice)] if advice else []), known)
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import is_time_of_day
+from stitch.plugins.intake.column_names import bare_name
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.text_files import read_any_text, shortened
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 # A pose as Universal Robots writes it: p[0.1, 0.2, …].
 _POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
@@ -54,7 +55,7 @@ def parse_number(cell: str) -> float | None:
     if _NO_NUMBER.fullmatch(cell):
         return float("nan")
     if _NUMBER.fullmatch(cell):
-        return float(cell)
+        return float(re.sub("[dD]", "e", cell))
     if DECIMAL_COMMA.fullmatch(cell):
         return float(cell.replace(",", "."))
     return None
@@ -124,8 +125,9 @@ _FEWEST_CELLS = 6
 _SAMPLED = 2000
 # Longer lines are of drawings and documents.
 _LONGEST_LINE = 100_000
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ ]\d{3})+[.,]\d+)")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ \u202f\xa0\u2009]\d{3})+[.,]\d+)")
 _COMMENTS = ("#", "%", "//")
+_COORDINATES = {*"xyz", "rx", "ry", "rz", "rotx", "roty", "rotz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
 _MAX_TABLE_MB = 50
 
 
@@ -152,7 +154,7 @@ def read_number_table(file: Path) -> NumberTable:
 
 def parse_number_table(file: Path, content: str) -> NumberTable:
     """The same of a text that was read from a file."""
-    lines = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1)]
+    lines = [(i, line.strip()) for i, line in enumerate(content.replace("\u2212", "-").splitlines(), 1)]
     kept = [(i, line) for i, line in lines if line and not _RULE.fullmatch(line)]
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     # Where every line is marked, #1 is a row's number.
@@ -167,16 +169,19 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
     header, rows = _split_labels(header, rows)
     text, numeric = _text_and_number_columns(rows)
+    cut = _is_cut_short(content, [row[numeric[-1]] for _, row in rows] if numeric else [])
+    rows = rows[:-1] if cut else rows
     if len(numeric) < (1 if header else _SEVERAL):
         raise _no_rows(file)
     numbers = np.array(
         [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
     )
     _require_one_decimal_mark(file, rows, numeric)
-    _require_no_thousands(file, rows, text)
+    _require_numbers(file, header, rows, text)
     decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
     words += ", with a header" if header else ", without a header"
+    words += ", the last row is cut short and left out" * cut
     if above:
         words += f", {above} line{'s' * (above > 1)} of words above it passed over"
     return NumberTable(
@@ -248,11 +253,22 @@ def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]],
             )
 
 
-def _require_no_thousands(file: Path, rows: Sequence[tuple[int, list[str]]], text: Sequence[int]) -> None:
-    """Refuse marks for thousands, 1.358,401 or 1'358.401, that make a column of numbers one of words."""
-    found = next(((i, row[c]) for c in text for i, row in rows if _THOUSANDS.fullmatch(row[c])), None)
-    if found is not None:
-        raise _has_marks(file, *found)
+def _is_cut_short(content: str, cells: Sequence[str]) -> bool:
+    """Whether a text ends within its last number, which has fewer decimals than all others of its column."""
+    decimals = [len(re.split("[.,]", cell)[-1]) if re.search("[.,]", cell) else 0 for cell in cells]
+    return len(cells) > _SEVERAL and content[-1:].isdigit() and decimals[-1] < min(decimals[:-1]) == max(decimals[:-1])
+
+
+def _require_numbers(file: Path, header: list[str] | None, rows: NumberedRows, text: Sequence[int]) -> None:
+    """Refuse marks for thousands, and what begins with digits under the name of a coordinate: they make it words."""
+    for c in text:
+        name = header[c] if header else ""
+        for line, row in rows:
+            if _THOUSANDS.fullmatch(row[c]):
+                raise _has_marks(file, line, row[c])
+            if bare_name(name)[0] in _COORDINATES and re.match(r"[+-]?\d", row[c]):
+                told = f"{file} line {line}: {shortened(row[c])} in column {name} is no number"
+                raise Refusal(told, change(file, "write numbers there"))
 
 
 def _has_marks(file: Path, line: int, cell: str) -> Refusal:
@@ -370,7 +386,10 @@ def _merged_name(heads: list[list[str]], column: int) -> str:
 
 
 def _separator_of(lines: Sequence[str]) -> str:
-    counts = {s: [_number_count(split_cells(line, s)) for line in lines] for s in _SEPARATORS}
+    cells = {s: [split_cells(line, s) for line in lines] for s in _SEPARATORS}
+    counts = {s: [_number_count(row) for row in cells[s]] for s in _SEPARATORS}
+    if max(map(max, counts.values())) < _SEVERAL:  # "0.83 mm" in each cell
+        counts = {s: [sum(_label_and_number(c) is not None for c in row) for row in cells[s]] for s in _SEPARATORS}
     # A number in the words above a table is none of its cells.
     least = _SEVERAL if max(map(max, counts.values())) >= _SEVERAL else 1
     return max(counts, key=lambda s: sum(n for n in counts[s] if n >= least))

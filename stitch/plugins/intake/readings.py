@@ -21,6 +21,7 @@ from stitch.plugins.intake.layouts import POSE_UNITS, ColumnLayout, joint_layout
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.screening.hypotheses import ORDERS
+from stitch.screening.motions import rotation_angles
 from stitch.session.reading.robot_description import moving_joints, poses_of_urdf, robot_from_urdf
 from stitch.session.robot import Robot, forward
 
@@ -260,6 +261,28 @@ def _uncoupled(layout: ColumnLayout, urdf: Path, angle_unit: str | None) -> Iter
         joints[:, 2] += sign * joints[:, 1]
         for reading in joint_readings(replace(layout, joints=joints), urdf, angle_unit):
             yield replace(reading, variant=words)
+
+
+# Steps of poses and of the arm in the joints beside them turn alike within this, rad.
+_TURNS_ALIKE = 5e-3
+
+
+def with_uncoupled_joints(reading: Reading, urdf: Path | None) -> Reading:
+    """Return a reading of poses whose joints, beside them, count as the robot's description does: they turn as it."""
+    layout = reading.layout
+    if urdf is None or layout.joints is None or not layout.rotation.shape[1]:
+        return reading
+    try:
+        ways = [*joint_readings(layout, urdf, None), *_uncoupled(layout, urdf, None)]
+    except InputError:
+        return reading  # joints of another arm
+    turned, *others = (rotation_angles(frames.inverse(T[:-1]) @ T[1:]) for T in (reading.T, *(way.T for way in ways)))
+    off = [float(np.abs(other - turned).max()) for other in others]
+    best = ways[int(np.argmin(off))]
+    if min(off) > _TURNS_ALIKE or not best.variant:
+        return reading
+    words = f"{layout.words}; {best.variant}: only so the arm turns as the poses beside say"
+    return replace(reading, layout=replace(layout, joints=best.layout.joints, words=words))
 
 
 def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[str]:

@@ -1,36 +1,44 @@
-"""A tool, scanner, part or base that changed at one view: the views before it and those from it on fit, not both.
+"""A tool, scanner, part or base that changed: at one view, or two lists of poses that are mixed in one table.
 
-Where the robot's poses T_i carry the mount's frame and X is the hand-eye, another tool makes them T_i D from view k on,
-another base B T_i. The first shows in the hand-eyes of the two parts, the second in the motions across view k.
+Where the robot's poses T_i carry the mount's frame and X is the hand-eye, another tool makes them T_i D for some of the
+views, another base B T_i. The first shows in the hand-eyes of the two groups, the second in the motions between them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from stitch.numerics import frames
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Mask
 from stitch.plugins.intake.convention_choice import Interpretation
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.screening.conventions import fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
-from stitch.screening.motions import FEWEST, TRANSLATION_M, MotionFit, RelativeScans, fit_motions
+from stitch.screening.motions import (
+    FEWEST,
+    ROTATION,
+    TRANSLATION_M,
+    MotionFit,
+    RelativeScans,
+    fit_motions,
+    rotation_angles,
+)
 
-# Motions of a part, and of all with the change undone, that close: scans of a symmetric part register wrongly now and
+# Motions of a group, and of all with the change undone, that close: scans of a symmetric part register wrongly now and
 # then. Those that stay open are so much fewer than as it stands.
 _FITS, _LESS_OPEN = 0.75, 0.5
-# Views of a part, and readings tried of each half.
+# Views of a group, and readings tried of each half and of the whole.
 _FEWEST_VIEWS = 3
-_TRIED = 2
+_TRIED, _REFITS = 2, 2
 # A change of less, mm and rad, is none.
 _CHANGE_MM, _CHANGE_RAD = 1.0, 2e-3
 
 
 def require_no_change(clouds: Sequence[Path], motions: RelativeScans, ways: Sequence[Interpretation]) -> None:
-    """Refuse poses that fit in two parts and, with one change undone, as a whole; not as they stand.
+    """Refuse poses that fit in two groups and, with one change undone, as a whole; not as they stand.
 
     Args:
         clouds: in the order of the views.
@@ -38,68 +46,86 @@ def require_no_change(clouds: Sequence[Path], motions: RelativeScans, ways: Sequ
         ways: to read the poses.
 
     Raises:
-        InputError: names the view, the size of the change and what it leaves.
+        InputError: names the views, the size of the change and what it leaves.
     """
     count = len(clouds)
-    halves = [_within(motions, 0, count // 2), _within(motions, count // 2, count)]
     tried = [way.hypothesis(i) for i, way in enumerate(ways) if len(way.pairing.used) == count]
-    fits = [sorted(fit_hypotheses(tried, half, "mm"), key=lambda fit: fit.open)[:_TRIED] for half in halves]
+    first = np.arange(count) < count // 2
+    sides = (first, ~first, np.ones(count, bool))
+    fits = [sorted(fit_hypotheses(tried, _among(motions, s), "mm"), key=lambda fit: fit.open)[:_TRIED] for s in sides]
     found = []
-    for hypothesis in {fit.hypothesis.kind: fit.hypothesis for half in fits for fit in half}.values():
+    for hypothesis in {fit.hypothesis.kind: fit.hypothesis for some in fits for fit in some}.values():
         as_it_stands = fit_motions(hypothesis, motions, TRANSLATION_M / MM)
-        for k in range(_FEWEST_VIEWS, count - _FEWEST_VIEWS + 1):
-            change = _change_at(hypothesis, motions, k)
+        for later in _groups(as_it_stands, motions):
+            change = _change_of(hypothesis, motions, later)
             if (
                 change is not None
                 and change[1].closed >= _FITS
                 and 1 - change[1].closed <= _LESS_OPEN * (1 - as_it_stands.closed)
             ):
-                found.append((change[1].open, k, change, as_it_stands))
+                found.append((change[1].open, later, change, as_it_stands))
     if found:
-        _, k, (step, undone), as_it_stands = min(found, key=lambda one: one[0])
-        raise Refusal(_change_message(clouds, k, step, undone, as_it_stands), *_one_part_each(count, k))
+        _, later, (step, undone), as_it_stands = min(found, key=lambda one: one[0])
+        raise Refusal(_change_message(clouds, later, step, undone, as_it_stands), *_one_group_each(later))
 
 
-def _one_part_each(count: int, k: int) -> list[Fix]:
-    """Sessions of the views before the change, and of those from it on."""
-    first, last = f"1-{k}{',-' * (count - k)}", f"{'-,' * k}{k + 1}-{count}"
-    words = ("make one session of the scans before it", "another of those from it on")
+def _groups(fit: MotionFit, motions: RelativeScans) -> Iterator[Mask]:
+    """Yield views of which something may have changed: from each on, every second, those that no closing motion links
+    to the largest group."""
+    T, X = fit.hypothesis.T_reference_mount, fit.T_mount
+    count = len(T)
+    yield from (np.arange(count) >= k for k in range(_FEWEST_VIEWS, count - _FEWEST_VIEWS + 1))
+    yield np.arange(count) % 2 == 1
+    v, w = np.array(motions.pairs).T
+    for _ in range(_REFITS):
+        off = frames.inverse(T[v] @ X @ motions.T) @ T[w] @ X
+        closes = (rotation_angles(off) < ROTATION) & (np.linalg.norm(off[:, :3, 3], axis=1) < TRANSLATION_M / MM)
+        closing = RelativeScans(tuple(p for p, c in zip(motions.pairs, closes, strict=True) if c), motions.T[closes])
+        X = fit_motions(fit.hypothesis, closing, TRANSLATION_M / MM).T_mount
+    group = np.arange(count)
+    for a, b in zip(v[closes], w[closes], strict=True):
+        group[group == group[b]] = group[a]
+    largest = np.bincount(group).argmax()
+    if _FEWEST_VIEWS <= (group != largest).sum() <= count - _FEWEST_VIEWS:
+        yield group != largest
+
+
+def _one_group_each(later: Mask) -> list[Fix]:
+    """Sessions of the views of either group."""
+    words = ("make one session of the first scans", "another of the others")
+    rows = [",".join(str(i + 1) if kept else "-" for i, kept in enumerate(side)) for side in (~later, later)]
     return [
-        Fix(f"{told}, --rows={rows} -o {name}", {"rows": rows, "output": name})
-        for told, rows, name in zip(words, (first, last), ("before", "after"), strict=True)
+        Fix(f"{told}, --rows={row} -o {name}", {"rows": row, "output": name})
+        for told, row, name in zip(words, rows, ("before", "after"), strict=True)
     ]
 
 
-def _within(motions: RelativeScans, first: int, end: int) -> RelativeScans:
-    kept = [i for i, pair in enumerate(motions.pairs) if first <= min(pair) and max(pair) < end]
+def _among(motions: RelativeScans, views: Mask) -> RelativeScans:
+    kept = [i for i, pair in enumerate(motions.pairs) if views[list(pair)].all()]
     return RelativeScans(tuple(motions.pairs[i] for i in kept), motions.T[kept])
 
 
-def _change_at(hypothesis: Hypothesis, motions: RelativeScans, k: int) -> tuple[Array, MotionFit] | None:
-    """Return the change (4, 4), mm, and the fit with it undone; None where a part does not fit or nothing changed."""
-    count = len(hypothesis.T_reference_mount)
-    parts = [_within(motions, 0, k), _within(motions, k, count)]
-    if min(len(part.pairs) for part in parts) < FEWEST:
+def _change_of(hypothesis: Hypothesis, motions: RelativeScans, later: Mask) -> tuple[Array, MotionFit] | None:
+    """Return the change (4, 4), mm, and the fit with it undone; None where a group does not fit or nothing changed."""
+    parts = [_among(motions, side) for side in (~later, later)]
+    # Of few motions among the later views their own hand-eye is not known: only the base can have changed.
+    fits = [fit_motions(hypothesis, part, TRANSLATION_M / MM) for part in parts if len(part.pairs) >= FEWEST]
+    if len(parts[0].pairs) < FEWEST or min(fit.closed for fit in fits) < _FITS:
         return None
-    before, after = (fit_motions(hypothesis, part, TRANSLATION_M / MM) for part in parts)
-    if min(before.closed, after.closed) < _FITS:
-        return None
+    before = fits[0]
     T = np.array(hypothesis.T_reference_mount)
-    tool = before.T_mount @ frames.inverse(after.T_mount)
-    if _is_change(tool):
-        T[k:] = T[k:] @ frames.inverse(tool)
-        change = tool
+    change = before.T_mount @ frames.inverse(fits[-1].T_mount)
+    if _is_change(change):
+        T[later] = T[later] @ frames.inverse(change)
     else:
-        across = [i for i, (v, w) in enumerate(motions.pairs) if v < k <= w]
         X = before.T_mount
-        bases = [
-            T[w] @ frames.inverse(T[v] @ X @ motions.T[i] @ frames.inverse(X))
-            for i, (v, w) in zip(across, (motions.pairs[i] for i in across), strict=True)
-        ]
+        across = [(v, w, m) for (v, w), m in zip(motions.pairs, motions.T, strict=True) if later[v] != later[w]]
+        steps = [T[w] @ X @ frames.inverse(T[v] @ X @ motion) for v, w, motion in across]
+        bases = [step if later[w] else frames.inverse(step) for (_, w, _), step in zip(across, steps, strict=True)]
         if not bases:
             return None
         change = min(bases, key=lambda base: sum(np.linalg.norm(base[:3, 3] - other[:3, 3]) for other in bases))
-        T[k:] = frames.inverse(change) @ T[k:]
+        T[later] = frames.inverse(change) @ T[later]
     if not _is_change(change):
         return None
     flange = T if hypothesis.mount == "eye_in_hand" else frames.inverse(T)
@@ -111,11 +137,16 @@ def _is_change(T: Array) -> bool:
     return bool(np.linalg.norm(T[:3, 3]) > _CHANGE_MM or np.linalg.norm(step[:3]) > _CHANGE_RAD)
 
 
-def _change_message(clouds: Sequence[Path], k: int, change: Array, undone: MotionFit, as_it_stands: MotionFit) -> str:
+def _change_message(
+    clouds: Sequence[Path], later: Mask, change: Array, undone: MotionFit, as_it_stands: MotionFit
+) -> str:
     shift = ", ".join(f"{x + 0.0:.1f}" for x in change[:3, 3])
     turn = np.degrees(np.linalg.norm(frames.log(change[None])[0, :3]))
+    names = [cloud.name for cloud, is_later in zip(clouds, later, strict=True) if is_later]
+    at_one = (np.diff(later.astype(int)) >= 0).all()
+    told = f"a tool, the scanner, the part or the base changed at {names[0]}: the scans before it and those from it on"
+    told = told if at_one else f"two lists of poses are mixed: {', '.join(names)} and the other scans"
     return (
-        f"{clouds[0].parent}: a tool, the scanner, the part or the base changed at {clouds[k].name}: the scans before "
-        f"it and those from it on fit each among themselves, by ({shift}) mm and {turn:.2f}° from another; with that "
-        f"undone {undone.closed:.0%} of the scanner's motions close, as it stands {as_it_stands.closed:.0%}"
+        f"{clouds[0].parent}: {told} fit each among themselves, by ({shift}) mm and {turn:.2f}° from another; with "
+        f"that undone {undone.closed:.0%} of the scanner's motions close, as it stands {as_it_stands.closed:.0%}"
     )

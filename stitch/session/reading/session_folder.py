@@ -31,6 +31,7 @@ from stitch.session.reading.session_toml import (
     read_scanner,
     read_session_document,
     session_name,
+    usual_guesses,
 )
 from stitch.session.reading.target_tables import read_frames, read_points, read_targets
 from stitch.session.reading.text_files import (
@@ -116,6 +117,7 @@ def load_session(
         views=tuple(views),
         nominal=_read_nominal(path, views) if scans else None,
         repeatability=read_repeatability(file, document.get("robot")),
+        usual=usual_guesses(file, document),
     )
     if axes:
         session = as_stated(replace(session, has_poses=has_poses), axes)

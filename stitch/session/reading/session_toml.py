@@ -75,6 +75,16 @@ def read_session_document(file: Path) -> dict[str, Any]:
     return document
 
 
+def usual_guesses(file: Path, document: dict[str, Any]) -> dict[str, str]:
+    """Return what `stitch init` took because it is usual and nothing shows it: comments with "?", as long as they hold.
+
+    Args:
+        document: of the file; what it states otherwise by now is no guess.
+    """
+    found = re.findall(r"^# \? (\w+): ([^;,\n]+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+    return {what: value for what, value in found if document.get(what, value) == value}
+
+
 def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = ()) -> None:
     """Refuse a table of session.toml with keys that nobody knows, or that do not count where it comes from.
 

@@ -59,6 +59,11 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     assert "--force, with the flag" in comment and "(--rotation" in " ".join(comment.split())
 
 
+def second_table(raw):
+    """Other poses beside those of the clouds."""
+    (raw / "robot.txt").write_text((raw / "RobotPoses.dat").read_text().replace("0.", "0.1"))
+
+
 def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path, capsys):
     clouds = [view.cloud.points for view in load_session(session).views]
     low, high = (np.quantile(np.concatenate(clouds), share, axis=0) for share in (0.1, 0.9))
@@ -130,7 +135,7 @@ def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, mon
         (lambda raw: (raw / "RobotPoses.dat").unlink(), (), "--poses"),
         (lambda raw: [f.unlink() for f in raw.glob("*.ply")], (), "no clouds there, only 1 .dat"),
         (lambda raw: [f.rename(f.with_suffix(".zip")) for f in raw.glob("*.ply")], (), "unpack it"),
-        (lambda raw: shutil.copy(raw / "RobotPoses.dat", raw / "robot.txt"), (), "several files"),
+        (second_table, (), "several lists"),
         (lambda raw: None, ("--rotation", "zyx"), "--rotation zyx: to fix: use xyz-intrinsic"),
         (lambda raw: None, ("--columns", "x,y,z"), "3 names"),
         (lambda raw: None, ("--columns", "x,x,z,rx,ry,rz"), "x stands twice"),

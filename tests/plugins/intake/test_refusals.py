@@ -104,7 +104,12 @@ INPUTS = {
         "no list of poses there",
         {},
     ),
-    "two tables": (lambda f: shutil.copy(f / TABLE, f / "robot.txt"), {}, "several files", {}),
+    "two tables": (
+        lambda f: (f / "robot.txt").write_text((f / TABLE).read_text().replace("0.", "0.1")),
+        {},
+        "several lists",
+        {},
+    ),
     "few names": (nothing, {"columns": "x,y,z"}, "3 names", {}),
     "a name twice": (nothing, {"columns": "x,x,z,rx,ry,rz"}, "x stands twice", {}),
     "unknown order": (nothing, {"rotation": "zyx"}, "--rotation zyx", {}),
@@ -164,7 +169,7 @@ ELSEWHERE = {
     "require_no_background", "require_own_frames", "require_scale", "require_no_change", "_require_fit",
     "_require_determined", "rows_with_scans", "_without_folder", "_from_workbook", "header_poses", "_no_rows",
     "_require_one_decimal_mark", "_split_header", "_read_file", "_in_another_unit", "_read_clouds", "_require_folder",
-    "_told_by_scans",
+    "_told_by_scans", "several_lists",
     "_no_clouds", "_has_marks", "named",  # these make one for others
 }  # fmt: skip
 REFUSING: set[str] = set()

@@ -20,14 +20,14 @@ X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array(
 CLOUDS = [Path(f"cell/scan_{i:02d}.ply") for i in range(10)]
 
 
-def campaign(tool=None, base=None):
-    """Ways to read ten poses, changed from the sixth on, and the exact motions of the scans."""
+def campaign(tool=None, base=None, views=slice(5, None)):
+    """Ways to read ten poses, changed at some of them, and the exact motions of the scans."""
     random = np.random.default_rng(5)
     T = frames.make(Rotation.random(10, random).as_matrix(), random.uniform(-400, 400, (10, 3)))
     pairs = [(v, v + step) for step in (1, 2) for v in range(10 - step)]
     motions = np.array([frames.inverse(T[v] @ X) @ T[w] @ X for v, w in pairs])
     written = T.copy()
-    written[5:] = (np.eye(4) if base is None else base) @ T[5:] @ (np.eye(4) if tool is None else tool)
+    written[views] = (np.eye(4) if base is None else base) @ T[views] @ (np.eye(4) if tool is None else tool)
     raw = RawPoses("poses", None, written.reshape(-1, 16), ((),) * 10, "")
     (layout,) = possible_layouts(raw)
     pairing = Pairing(tuple(range(10)), "", True)
@@ -45,3 +45,16 @@ def test_a_change_is_named_with_its_view_and_its_size(side):
     with pytest.raises(InputError, match="changed at scan_05.ply") as refused:
         require_no_change(CLOUDS, *campaign(**{side: change}))
     assert "150.0) mm and 0.00°" in str(refused.value) and "100% of the scanner's motions close" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("side", "views"), [("tool", slice(1, None, 2)), ("base", slice(1, None, 2)), ("base", [1, 3, 6, 8])]
+)
+def test_two_lists_in_one_table_are_named_with_their_views(side, views):
+    change = frames.make(np.eye(3), np.array([0.0, 30.0, 150.0]))
+    with pytest.raises(InputError, match="two lists of poses are mixed") as refused:
+        require_no_change(CLOUDS, *campaign(**{side: change}, views=views))
+    named = {cloud.name for cloud in CLOUDS if cloud.name in str(refused.value)}
+    changed = {CLOUDS[i].name for i in np.arange(10)[views]}
+    assert named in (changed, {cloud.name for cloud in CLOUDS} - changed)
+    assert "30.0, 150.0) mm" in str(refused.value).replace("-", "") and "100% of" in str(refused.value)
