@@ -45,7 +45,7 @@ def trial(job: Row) -> Row:
         truth = drawn.write(folder, campaign)
         options: dict[str, str] = {}
         asked: list[str] = []
-        outcome, marked, told = "", 0, ""
+        outcome, marked, unmarked, told = "", 0, 0, ""
         for _ in range(STEPS):
             try:
                 made = make_session(folder, out, options, guess=bool(asked), force=True)
@@ -60,11 +60,14 @@ def trial(job: Row) -> Row:
                 asked += answer
                 continue
             outcome = verdict(session, made, truth, campaign.clouds)
-            marked = sum(g.because == "usual" and g.what in ("rotation", "pairing", "columns") for g in made.guesses)
+            usual = [g.what for g in made.guesses if g.because == "usual"]
+            marked = sum(what in ("rotation", "pairing", "columns") for what in usual)
+            unmarked = len(made.guesses) - len(usual)
             break
     drawing = {"format": drawn.format, "mistake": drawn.mistake, "inverse": drawn.inverse}
     drawing |= {"units": f"{drawn.unit}/{drawn.cloud_unit}", "named": drawn.named}
-    return drawing | {"outcome": outcome or "circle", "asked": asked, "marked": marked, "told": told[:300]}
+    counts = {"marked": marked, "unmarked": unmarked}
+    return drawing | counts | {"outcome": outcome or "circle", "asked": asked, "told": told[:300]}
 
 
 def answer_of(refused: InputError, truth: Truth, given: dict[str, str]) -> dict[str, str] | None:
@@ -126,6 +129,8 @@ def summary(rows: list[Row]) -> list[str]:
         ("round in a circle", lambda r: r["outcome"] == "circle"),
     ]
     lines = [[words, share(holds(row) for row in rows)] for words, holds in shown]
+    silent = sum(row["outcome"].count(",") + 1 for row in rows if row["outcome"].startswith("silently"))
+    lines.append(["guesses without a mark that are wrong", f"{silent}/{sum(row['unmarked'] for row in rows)}"])
     right = [row for row in rows if row["outcome"] == "right"]
     lines.append(
         ["right ones whose rotation, pairing and columns bear no mark", share(not row["marked"] for row in right)]

@@ -75,7 +75,8 @@ _PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
 _OWN = {"session.toml": b"stitch-session", "targets.csv": b"target,"}
 _OWN |= dict.fromkeys(("views.csv", "points.csv", "frames.csv"), b"view,")
 # Robots, pictures and documents.
-_NO_POSES = (".urdf", ".xacro", ".md", ".html", ".pdf", ".py", ".toml", ".mtl")
+_DOCUMENTS = (".md", ".html", ".py")
+_NO_POSES = (".urdf", ".xacro", ".pdf", ".toml", ".mtl", *_DOCUMENTS)
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
@@ -149,6 +150,8 @@ def find_folder_files(
         inventory = open_ = [_stated_list(file, part, taken)]
     elif candidates or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
         inventory = take_inventory(candidates, accepts)
+        if all(found.why_not for found in inventory):  # what is written for people may hold them all the same
+            inventory += take_inventory([f for f in files if f.suffix.lower() in _DOCUMENTS], accepts)
         if inventory or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
             open_, alike = choose_list(folder, inventory, clouds)
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]

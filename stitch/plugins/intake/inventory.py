@@ -125,9 +125,7 @@ def _reason(error: Exception, file: Path) -> str:
     return str(error).split("; to fix")[0].removeprefix(str(file)).lstrip(": ")
 
 
-def choose_list(
-    folder: Path, inventory: Sequence[FoundList], clouds: Sequence[Path]
-) -> tuple[list[FoundList], int]:
+def choose_list(folder: Path, inventory: Sequence[FoundList], clouds: Sequence[Path]) -> tuple[list[FoundList], int]:
     """Return the lists that serve as many clouds, the likely one first, and how many of them rank as it does.
 
     Raises:

@@ -10,12 +10,11 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES
 from stitch.plugins.intake.clock_times import EPOCH_S, since_1970
 from stitch.plugins.intake.column_names import read_names
-from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.raw_poses import RawPoses, is_rotation
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 
 # A quaternion with three digits has length 1 within this.
 _UNIT_LENGTH = 5e-3
-_ORTHONORMAL = 1e-2
 # Columns of a turntable's angle, and of joints by the words that drivers use.
 _TURNTABLE = re.compile(r"turn|table|angle|winkel|dreh|theta|azimut|rotat|plate|deg|^rot$|^phi$|^c$", re.IGNORECASE)
 _JOINT_WORDS = re.compile(r"joint|shoulder|elbow|wrist|axis_?\d", re.IGNORECASE)
@@ -194,7 +193,13 @@ def _six_column_layouts(x: Array) -> list[ColumnLayout]:
 def _seven_column_layouts(x: Array) -> list[ColumnLayout]:
     ahead = ColumnLayout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 7 the quaternion")
     behind = ColumnLayout(x[:, 4:], x[:, :4], None, "columns 1 to 4 are the quaternion, 5 to 7 the position")
-    return [layout for layout in (ahead, behind) if _is_quaternion(layout.rotation)]
+    found = [layout for layout in (ahead, behind) if _is_quaternion(layout.rotation)]
+    axis, angle = x[:, 3:6], x[:, 6:]
+    if not found and (np.abs(np.linalg.norm(axis, axis=1) - 1) < _UNIT_LENGTH).all():
+        vectors = axis * (np.radians(angle) if np.abs(angle).max() > _TURN else angle)
+        words = "columns 1 to 3 are the position, 4 to 6 an axis, 7 the angle about it"
+        return [replace(ahead, rotation=vectors, words=words, convention="rotation-vector", angle_unit="rad")]
+    return found
 
 
 def _is_quaternion(q: Array) -> bool:
@@ -209,14 +214,14 @@ def _twelve_column_layouts(x: Array) -> list[ColumnLayout]:
         ColumnLayout(x[:, 9:], x[:, :9], None, "columns 1 to 9 are the rotation, 10 to 12 the position"),
         ColumnLayout(x[:, :3], x[:, 3:], None, "columns 1 to 3 are the position, 4 to 12 the rotation"),
     )
-    return [layout for layout in forms if _is_rotation(layout.rotation)]
+    return [layout for layout in forms if is_rotation(layout.rotation)]
 
 
 def _sixteen_column_layouts(x: Array) -> list[ColumnLayout]:
     """4×4 matrices by rows, or by columns: the row 0 0 0 1 tells."""
     T = x.reshape(-1, 4, 4)
     for words, M in (("4×4 matrices by rows", T), ("4×4 matrices by columns", T.transpose(0, 2, 1))):
-        if np.allclose(M[:, 3], [0, 0, 0, 1], atol=1e-6) and _is_rotation(M[:, :3, :3].reshape(-1, 9)):
+        if np.allclose(M[:, 3], [0, 0, 0, 1], atol=1e-6) and is_rotation(M[:, :3, :3].reshape(-1, 9)):
             return [ColumnLayout(M[:, :3, 3], M[:, :3, :3].reshape(-1, 9), None, words, "matrix")]
     return []
 
@@ -234,11 +239,6 @@ def _layouts_among(raw: RawPoses) -> list[ColumnLayout]:
                 rest = rest if raw.header else {}
                 return [replace(layout, words=f"{where}: {layout.words}", rest=rest) for layout in found]
     return []
-
-
-def _is_rotation(rows: Array) -> bool:
-    R = rows.reshape(-1, 3, 3)
-    return bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL and (np.linalg.det(R) > 0).all())
 
 
 def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:

@@ -5,18 +5,12 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from typing import Any
 
-import numpy as np
-
 from stitch.plugins.intake.pose_formats import PoseRow
-from stitch.plugins.intake.pose_tables import (
-    parse_number,
-)
+from stitch.plugins.intake.pose_tables import parse_number
 
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 # Sizes of a bare list of numbers that can be a pose or joint angles.
 _SIZES = (5, 6, 7, 8, 9, 12, 16)
-# An axis of rotation has length 1 within this; a larger angle is in degrees.
-_UNIT_AXIS, _TURN = 1e-3, 2 * np.pi + 1e-3
 _MATRICES = ((3, 3), (3, 4), (4, 4), (1, 3), (3, 1), (1, 4), (4, 1))
 
 
@@ -44,7 +38,9 @@ def nested_lists(document: Any, texts: tuple[str, ...] = ()) -> dict[str, list[P
             alike = [(words, row) for words, row in direct if not stem or _LAST_NUMBER.sub("#", words[0]) == stem]
             if len(alike) > 1 and len({tuple(row) for _, row in alike}) == 1:
                 out[stem.replace("#", "").strip("_- ")] = alike
-        for key, value in document.items():
+        of_one_kind = several or len(stems) == 1
+        listed = {words[0] for rows in out.values() for words, _ in rows if words and of_one_kind}
+        for key, value in ((key, value) for key, value in document.items() if str(key) not in listed):
             below = nested_lists(value, (*texts, *_texts(document)))
             out |= {f"{key}.{path}".strip("."): rows for path, rows in below.items()}
     return out
@@ -82,20 +78,8 @@ def _pose_numbers(value: Any) -> dict[str, float] | None:
         unnamed = all(name.isdigit() for name in inner)
         beside = _ros_stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
         return inner if unnamed else beside | inner
-    out = _axis_times_angle(_named_numbers(value))
+    out = _named_numbers(value)
     return out if len(out) >= _SIZES[0] else None
-
-
-def _axis_times_angle(numbers: dict[str, float]) -> dict[str, float]:
-    """Return numbers with an axis of length 1 and the angle about it, rad or degrees, as one vector of rotation."""
-    axis = [name for name in numbers if re.search(r"axis[._]?[0-2xyz]$", name, re.IGNORECASE)]
-    angle = [name for name in numbers if re.search(r"angle(_?(rad|deg))?$", name, re.IGNORECASE)]
-    if len(axis) != 3 or len(angle) != 1 or abs(np.linalg.norm([numbers[name] for name in axis]) - 1) > _UNIT_AXIS:
-        return numbers
-    in_degrees = angle[0].lower().endswith("deg") or abs(numbers[angle[0]]) > _TURN
-    size = np.radians(numbers[angle[0]]) if in_degrees else numbers[angle[0]]
-    kept = {name: x for name, x in numbers.items() if name not in (*axis, *angle)}
-    return kept | {f"rv{k} [rad]": size * numbers[name] for k, name in zip("xyz", axis, strict=True)}
 
 
 def _ros_stamp(value: dict[str, Any]) -> dict[str, float]:
@@ -120,7 +104,7 @@ def _matrix_numbers(value: dict[str, Any]) -> list[float] | None:
         return None
     flat = _flat_numbers(inner[0])
     if flat is not None:
-        return flat if len(flat) in (12, 16) else None
+        return flat if len(flat) in (12, 16) or ("rows" in value and len(flat) in (3, 9)) else None
     return _matrix_numbers(inner[0]) if isinstance(inner[0], dict) else None
 
 

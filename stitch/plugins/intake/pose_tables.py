@@ -43,7 +43,7 @@ def split_cells(line: str, separator: str) -> list[str]:
     line = _GROUPS.sub(separator, _MARKED_NUMBER.sub(lambda mark: mark[0] + separator, line))
     line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
-        return line.split()
+        return line.rstrip(";,").split()
     row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
     return [cell.strip().strip('"') for cell in row]
 
@@ -389,7 +389,8 @@ def _separator_of(lines: Sequence[str]) -> str:
     cells = {s: [split_cells(line, s) for line in lines] for s in _SEPARATORS}
     counts = {s: [_number_count(row) for row in cells[s]] for s in _SEPARATORS}
     if max(map(max, counts.values())) < _SEVERAL:  # "0.83 mm" in each cell
-        counts = {s: [sum(_label_and_number(c) is not None for c in row) for row in cells[s]] for s in _SEPARATORS}
+        labelled = {s: [sum(_label_and_number(c) is not None for c in row) for row in cells[s]] for s in _SEPARATORS}
+        counts = labelled if max(map(max, labelled.values())) >= _SEVERAL else counts
     # A number in the words above a table is none of its cells.
     least = _SEVERAL if max(map(max, counts.values())) >= _SEVERAL else 1
     return max(counts, key=lambda s: sum(n for n in counts[s] if n >= least))

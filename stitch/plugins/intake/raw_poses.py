@@ -39,6 +39,9 @@ from stitch.session.reading.yaml_file import parse_yaml
 ARRAYS = (".npy", ".npz", ".mat")
 STRUCTURED = (".json", ".yaml", ".yml", *ARRAYS)
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".log", ".va", ".pos")
+_ORTHONORMAL = 1e-2
+# An axis of rotation has length 1 within this; a larger angle is in degrees.
+_UNIT_AXIS, _TURN = 1e-3, 2 * np.pi + 1e-3
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _MAX_POSES_MB = 50
 _ROWS_SHOWN = 3
@@ -187,7 +190,7 @@ def read_lists(file: Path) -> list[RawPoses]:
     if is_program(file):
         return [program_poses(file)]
     if suffix in ARRAYS:
-        return _from_numpy(file)
+        return _with_joined(_from_numpy(file))
     if suffix in WORKBOOKS:
         return _from_workbook(file)
     text = read_any_text(file, "name a file of poses", _MAX_POSES_MB)
@@ -204,7 +207,7 @@ def read_lists(file: Path) -> list[RawPoses]:
                 document = xml_document(ElementTree.fromstring(text))
                 lists = {path: (rows, "XML") for path, rows in nested_lists(document).items()}
     if lists or suffix in (".json", ".yaml", ".yml"):
-        return _from_lists(file, lists)
+        return _with_joined(_from_lists(file, lists))
     try:
         table = parse_number_table(file, text)
     except InputError:
@@ -216,6 +219,25 @@ def read_lists(file: Path) -> list[RawPoses]:
         table = parse_number_table(file, block[0])
         table = replace(table, words=f"{table.words}; {block[1]}")
     return [_matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)]
+
+
+def _with_joined(lists: list[RawPoses]) -> list[RawPoses]:
+    """Return lists of a file, rotations of nine numbers with the positions that stand in another list behind them."""
+    turns = [raw for raw in lists if raw.numbers.shape[1] == 9 and is_rotation(raw.numbers)]
+    shifts = [raw for raw in lists if raw.numbers.shape[1] == 3]
+    joined = [
+        replace(R, header=None, numbers=np.hstack([R.numbers, t.numbers]), part=f"{R.part}+{t.part}")
+        for R in turns
+        for t in shifts
+        if len(R.numbers) == len(t.numbers)
+    ]
+    return [*joined, *lists]
+
+
+def is_rotation(rows: Array) -> bool:
+    """Whether rows of nine numbers are rotations, row by row."""
+    R = rows.reshape(-1, 3, 3)
+    return bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL and (np.linalg.det(R) > 0).all())
 
 
 def _from_workbook(file: Path) -> list[RawPoses]:
@@ -240,6 +262,8 @@ def _raw_poses(
     Raises:
         InputError: hardly a row is whole.
     """
+    if header is not None:
+        header, numbers = _axis_times_angle(header, numbers)
     broken = np.asarray(~np.isfinite(numbers).all(axis=1), bool)
     if len(numbers) > 1 and (~broken).sum() < _FEWEST_WHOLE * len(numbers):
         raise Refusal(
@@ -248,6 +272,21 @@ def _raw_poses(
         )
     whole = np.where(broken[:, None], numbers[np.argmin(broken)], numbers) if broken.any() else numbers
     return RawPoses(source, header, whole, tuple(labels), words, frozenset(np.flatnonzero(broken).tolist()))
+
+
+def _axis_times_angle(header: tuple[str, ...], numbers: Array) -> tuple[tuple[str, ...], Array]:
+    """Return columns with an axis of length 1 and the angle about it, rad or degrees, as one vector of rotation."""
+    axis = [i for i, name in enumerate(header) if re.search(r"axis[._]?[0-2xyz]$", name, re.IGNORECASE)]
+    angle = [i for i, name in enumerate(header) if re.search(r"angle([._\s]*(rad|deg))?\W*$", name, re.IGNORECASE)]
+    if len(axis) != 3 or len(angle) != 1:
+        return header, numbers
+    if np.abs(np.linalg.norm(numbers[:, axis], axis=1) - 1).max() > _UNIT_AXIS:
+        return header, numbers
+    size = numbers[:, angle]
+    size = np.radians(size) if "deg" in header[angle[0]].lower() or np.abs(size).max() > _TURN else size
+    kept = [i for i in range(len(header)) if i not in (*axis, *angle)]
+    names = (*(header[i] for i in kept), *(f"rv{k} [rad]" for k in "xyz"))
+    return names, np.hstack([numbers[:, kept], size * numbers[:, axis]])
 
 
 def _matrix_blocks(table: NumberTable) -> RawPoses | None:
@@ -331,6 +370,11 @@ def _named_arrays(file: Path) -> dict[str, Array]:
         name, value = waiting.pop(0)
         if isinstance(value, dict):
             waiting += [(f"{name}.{key}", inner) for key, inner in value.items()]
+        elif isinstance(value, (list, np.ndarray)) and len(value) and all(isinstance(one, dict) for one in value):
+            waiting += [(f"{name}.{key}", [one[key] for one in value if key in one]) for key in value[0]]
+        elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
+            if len({np.shape(one) for one in value}) == 1:
+                arrays[name] = np.array(list(value))
         elif isinstance(value, np.ndarray):
             by_last = value.ndim == 3 and value.shape[:2] in ((4, 4), (3, 4)) and value.shape[1:] != (4, 4)
             arrays[name] = value.transpose(2, 0, 1) if by_last else value

@@ -1,7 +1,6 @@
 """stitch init at the command line: what it writes, asks and refuses."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest

@@ -136,6 +136,12 @@ INPUTS = {
     ),
     "a word": (cells(1, 2, "abc"), {}, "is no number", {}),
     "marks for thousands": (cells(1, 4, "1'203.441"), {}, "marks for thousands", {}),
+    "digits that are no numbers": (
+        lines(lambda rows: ["rx,ry,rz,x,y,z", *(f"{row.strip(',')}/1" for row in rows)]),
+        {},
+        "in column z is no number",
+        {},
+    ),
     "a row too short": (lines(lambda rows: [rows[0], rows[1][:20], rows[2]]), {}, "other rows have", {}),
     "a session there": (lambda f: (f / "session.toml").write_text(""), {"beside": "yes"}, "exists already", {}),
     "broken JSON": (written("poses.json", "{"), {"poses": "poses.json"}, "not valid JSON", {}),
