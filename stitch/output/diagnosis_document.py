@@ -15,16 +15,7 @@ from stitch.observations.surfaces.field_error import FieldError
 from stitch.output.finding_screen import clearest_parameter, finding_screen
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import parameter_row
-from stitch.output.schema import (
-    NUMBER,
-    NUMBER_OR_NULL,
-    TEXT,
-    Document,
-    Key,
-    Kind,
-    list_of,
-    rows_of_fields,
-)
+from stitch.output.schema import NUMBER, NUMBER_OR_NULL, TEXT, Document, Key, Kind, list_of, rows_of_fields
 
 FORMAT = "stitch-diagnosis/1"
 # Of a cross-validation, what its verdict on a fitted effect needs.

@@ -28,13 +28,7 @@ from stitch.numerics.units import angle_text, display_unit, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.output.plain_finding import open_doubts
-from stitch.output.plain_words import (
-    DESCRIPTIONS,
-    EVENTS,
-    JOINT_DESCRIPTIONS,
-    effect_description,
-    plain_covariate,
-)
+from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, effect_description, plain_covariate
 from stitch.system.threads import remembered
 
 # Candidate effects that a screen compares: so many, and those that take 3 % of the rms on views left out (mean square).

@@ -42,14 +42,12 @@ MISTAKES: dict[str, dict[str, str]] = {
         "lagging": "every pose lags its scan by {share:.0%} of the way from the one before; to fix: record each pose "
         "once the arm stands still",
     },
-    "reversed": {
-        "reversed": "the poses are in reverse order; to fix: turn the list around",
-    },
+    "reversed": {"reversed": "the poses are in reverse order; to fix: turn the list around"},
     # The scanner's motions, or the targets, agree with all poses once these are inverted. Without joints the other
     # mount looks the same.
     "inverse": {
         "inverted": "the poses are T_flange_base, or the mount is not as stated (the size of the hand-eye shows "
-        'which); to fix: invert the poses, or set mount = "{mount}" in session.toml',
+        'which); to fix: invert the poses, or set mount = "{mount}" in session.toml'
     },
     # They agree with the other mount; or the scanner did not move at all.
     "mount": {
@@ -96,7 +94,7 @@ MISTAKES: dict[str, dict[str, str]] = {
     },
     "linear_axis": {
         "linear axis": "{column} is a linear axis that carries the robot, and the positions leave it out; to fix: "
-        "{where}",
+        "{where}"
     },
     # Once an axis has the other sign, or two are exchanged: in all poses, or in one cloud, which closes at its own
     # pose.
@@ -108,11 +106,9 @@ MISTAKES: dict[str, dict[str, str]] = {
         "mirrored cloud": "{flip} in this cloud; to fix: export it again",
     },
     # The poses that follow from the joints are right once these count otherwise; or one joint alone explains a view.
-    "joint_sign": {
-        "joint sign": "{joints} {count} the other way; to fix: negate {joints} in views.csv",
-    },
+    "joint_sign": {"joint sign": "{joints} {count} the other way; to fix: negate {joints} in views.csv"},
     "joint_coupling": {
-        "joint coupling": "j3 is shown as it moves with j2; to fix: write j3 {sign} j2 in place of j3 in views.csv",
+        "joint coupling": "j3 is shown as it moves with j2; to fix: write j3 {sign} j2 in place of j3 in views.csv"
     },
     "joint_row": {
         "copied joints": "{view} has the joint angles of {of}, and is {off}; to fix: put in its own",
@@ -124,9 +120,7 @@ MISTAKES: dict[str, dict[str, str]] = {
         "copied scan": "this scan is a copy of that of {of}; to fix: put the right file in its row",
         "copies": "The scans of {views} are the same points; to fix: put the right file in each row, or leave one out.",
     },
-    "duplicate_pose": {
-        "copied pose": "{view} has the pose of {of}, and is {off}; to fix: put in its own",
-    },
+    "duplicate_pose": {"copied pose": "{view} has the pose of {of}, and is {off}; to fix: put in its own"},
     # One scan closes elsewhere than at its pose, or with one half only; poses scatter by more than arms do, and nothing
     # else explains it; distances from one target to the others step or creep, those among the others do not.
     "displaced": {

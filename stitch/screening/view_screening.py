@@ -15,13 +15,7 @@ from stitch.fit.fit import FittedRig
 from stitch.numerics.frames import Array
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.run_data import ExcludedView, HandEyeTransfer, ViewLinks
-from stitch.screening.deep_check import (
-    deep_check,
-    refuse,
-    refuse_contradiction,
-    refuse_whole,
-    require_majority,
-)
+from stitch.screening.deep_check import deep_check, refuse, refuse_contradiction, refuse_whole, require_majority
 from stitch.screening.hypotheses import sentence
 from stitch.screening.model_transfer import require_matching_hand_eye
 from stitch.screening.pairing import explain_misplaced

@@ -13,12 +13,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Indices
 from stitch.session.capture import Capture, prepare_capture
-from stitch.session.scan import (
-    bounding_box,
-    even_indices,
-    prepare_scan,
-    subsample,
-)
+from stitch.session.scan import bounding_box, even_indices, prepare_scan, subsample
 from stitch.session.session import Cloud, Scanner, SessionData, View, WholeCloud
 from stitch.system.threads import parallel
 

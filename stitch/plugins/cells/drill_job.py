@@ -9,11 +9,7 @@ import numpy as np
 from stitch.errors import InputError, NoResultError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.plugins.cells.drill_checks import (
-    holes_in_flange,
-    read_pin,
-    read_trials,
-)
+from stitch.plugins.cells.drill_checks import holes_in_flange, read_pin, read_trials
 from stitch.plugins.cells.drilling_sensors import (
     HoleObservations,
     base_frame,

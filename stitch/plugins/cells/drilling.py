@@ -13,20 +13,9 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import value_uncertainty_text
 from stitch.output.session_files import SessionFiles, pose_columns
-from stitch.plugins.cells.drill_checks import (
-    STAGES,
-    PlatePlace,
-    TrialError,
-    plate_place,
-    trial_error,
-)
+from stitch.plugins.cells.drill_checks import STAGES, PlatePlace, TrialError, plate_place, trial_error
 from stitch.plugins.cells.drill_job import DrillJob, Hole, read_drill_job
-from stitch.plugins.cells.drill_servo import (
-    calibrate_sensors,
-    drive_onto_references,
-    looker,
-    turn_upright,
-)
+from stitch.plugins.cells.drill_servo import calibrate_sensors, drive_onto_references, looker, turn_upright
 from stitch.plugins.cells.drilling_sensors import (
     CameraEffectTest,
     FlangeSensors,
@@ -39,13 +28,7 @@ from stitch.plugins.cells.drilling_sensors import (
     hole_rotation,
     leave_one_out,
 )
-from stitch.plugins.cells.job_files import (
-    Wanted,
-    fixed_digits,
-    hand_out,
-    points_table,
-    write_columns,
-)
+from stitch.plugins.cells.job_files import Wanted, fixed_digits, hand_out, points_table, write_columns
 
 _ABSENT_EFFECTS = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
 

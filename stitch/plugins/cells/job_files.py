@@ -239,11 +239,7 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
 
 
 def hand_out(
-    command: str,
-    wanted: Wanted,
-    sessions: Callable[[], list[SessionFiles]],
-    document: Callable[[], Any],
-    *results: Any,
+    command: str, wanted: Wanted, sessions: Callable[[], list[SessionFiles]], document: Callable[[], Any], *results: Any
 ) -> Console | None:
     """Write sessions, recording and page of a command's job and result (`results`), and its JSON, as far as wanted.
 

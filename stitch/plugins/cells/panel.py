@@ -608,12 +608,7 @@ def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
         written = write_folder(job, result, wanted.output) + write_pictures("panel", wanted.output, job, result)
     steps = {"corrections": {"largest_deviation": largest}} if largest else {}
     terminal = hand_out(
-        "panel",
-        wanted,
-        lambda: robot_sessions(job, result),
-        lambda: panel_document(job, result) | steps,
-        job,
-        result,
+        "panel", wanted, lambda: robot_sessions(job, result), lambda: panel_document(job, result) | steps, job, result
     )
     if terminal is None:
         return

@@ -418,8 +418,7 @@ def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder)
         per_metre = (camera.units_per_metre or 1000.0) * factor
         words = f'write depth_scale = {per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
         raise Refusal(
-            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm",
-            change(camera.source, words),
+            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm", change(camera.source, words)
         )
     if factor in (1000.0, 0.001) and stated.length_unit:
         raise Refusal(f"--unit {stated.length_unit}: {told}", Fix("leave --unit out", {"unit": ""}))

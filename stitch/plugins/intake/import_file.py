@@ -20,13 +20,11 @@ _File = Annotated[
     ),
 ]
 _Output = Annotated[
-    Path | None,
-    typer.Option("-o", "--output", metavar="TABLE", help="views.csv to write; default standard output."),
+    Path | None, typer.Option("-o", "--output", metavar="TABLE", help="views.csv to write; default standard output.")
 ]
 _Unit = Annotated[str, typer.Option("--unit", help="mm or m: the session's length_unit.")]
 _Frame = Annotated[
-    str | None,
-    typer.Option("--frame", help="Frame of the points in the base, numbers as the controller shows them."),
+    str | None, typer.Option("--frame", help="Frame of the points in the base, numbers as the controller shows them.")
 ]
 _Tool = Annotated[str | None, typer.Option("--tool", help="Tool in the flange, numbers as the controller shows them.")]
 _Columns = Annotated[

@@ -27,13 +27,7 @@ from stitch.plugins.intake.pose_tables import (
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
-from stitch.session.reading.text_files import (
-    WORKBOOKS,
-    read_any_text,
-    reason_of,
-    require_file,
-    workbook_sheets,
-)
+from stitch.session.reading.text_files import WORKBOOKS, read_any_text, reason_of, require_file, workbook_sheets
 from stitch.session.reading.yaml_file import parse_yaml
 
 ARRAYS = (".npy", ".npz", ".mat")
@@ -42,7 +36,6 @@ TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".l
 _ORTHONORMAL = 1e-2
 # An axis of rotation has length 1 within this; a larger angle is in degrees.
 _UNIT_AXIS, _TURN = 1e-3, 2 * np.pi + 1e-3
-_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _MAX_POSES_MB = 50
 _ROWS_SHOWN = 3
 # Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
@@ -235,7 +228,7 @@ def _with_joined(lists: list[RawPoses]) -> list[RawPoses]:
 
 
 def is_rotation(rows: Array) -> bool:
-    """Whether rows of nine numbers are rotations, row by row."""
+    """Whether nine numbers each, (V, 9) or (V, 3, 3), are rotations."""
     R = rows.reshape(-1, 3, 3)
     return bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL and (np.linalg.det(R) > 0).all())
 
@@ -292,25 +285,12 @@ def _axis_times_angle(header: tuple[str, ...], numbers: Array) -> tuple[tuple[st
 def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     """4×4 matrices, or 3×4 ones, over several lines each; None if the table is none of that."""
     x = table.numbers
-    if x.shape[1] != 4:
-        return None
-    for height in (4, 3):
-        if len(x) % height:
-            continue
-        blocks = x.reshape(-1, height, 4)
+    for height in (4, 3) if x.shape[1] == 4 else ():
+        blocks = x.reshape(-1, height, 4) if len(x) % height == 0 else x[:0, None]
         whole = blocks[np.isfinite(blocks).all(axis=(1, 2))]
-        if not len(whole):
-            continue
-        R = whole[:, :3, :3]
-        if height == 3 and np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3):
-            words = "3×4 matrices"
-        elif height == 4 and np.allclose(whole[:, 3], _LAST_ROW):
-            words = "4×4 matrices"
-        elif height == 4 and np.allclose(whole[:, :3, 3], 0) and np.allclose(whole[:, 3, 3], 1):
-            words = "4×4 matrices by columns"
-        else:
-            continue
-        return _raw_poses(str(table.file), None, blocks.reshape(len(blocks), -1), ((),) * len(blocks), words)
+        if len(whole) and is_rotation(whole[:, :3, :3]):
+            flat = blocks.reshape(len(blocks), -1)
+            return _raw_poses(str(table.file), None, flat, ((),) * len(flat), f"{height}×4 matrices")
     return None
 
 
@@ -325,8 +305,8 @@ def _records_of_lines(file: Path, text: str) -> RawPoses | None:
     for height in _RECORD_LINES:
         flat = x.reshape(-1, 3 * height) if len(x) % height == 0 and len(x) >= 3 * height else np.empty((0, 0))
         for first in range(0, flat.shape[1] - 8, 3):
-            R = flat[:, first : first + 9].reshape(-1, 3, 3)
-            if np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3) and np.ptp(R, axis=0).any():
+            turns = flat[:, first : first + 9]
+            if is_rotation(turns) and np.ptp(turns, axis=0).any():
                 return _raw_poses(str(file), None, flat, ((),) * len(flat), f"records of {height} lines")
     return None
 

@@ -5,17 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.convention_choice import (
-    ConventionChoice,
-    ConventionScore,
-)
+from stitch.plugins.intake.convention_choice import ConventionChoice, ConventionScore
 from stitch.plugins.intake.folder_files import FolderFiles
 from stitch.plugins.intake.guesses import Because, Guess
-from stitch.plugins.intake.layouts import (
-    POSE_UNITS,
-    covariate_columns,
-    size_words,
-)
+from stitch.plugins.intake.layouts import POSE_UNITS, covariate_columns, size_words
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.stated_folder import StatedFolder
 

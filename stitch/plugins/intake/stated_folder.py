@@ -10,14 +10,9 @@ import numpy as np
 from stitch.cli.options import split_names
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.detect import parse_target_options
-from stitch.plugins.intake.layouts import (
-    CLOUD_UNITS,
-)
+from stitch.plugins.intake.layouts import CLOUD_UNITS
 from stitch.plugins.intake.raw_poses import RawPoses
-from stitch.plugins.intake.readings import (
-    StatedTable,
-    require_known_word,
-)
+from stitch.plugins.intake.readings import StatedTable, require_known_word
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.plugins.intake.scan_targets import TargetSearch
 

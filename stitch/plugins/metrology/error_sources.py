@@ -29,12 +29,7 @@ from stitch.numerics.reml import NOISE, fit_variances
 from stitch.numerics.variance_posterior import mean_variances, satterthwaite
 from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, STOP_COMPONENTS, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import apparent_twists, view_columns
-from stitch.observations.surfaces.hand_eye_fit import (
-    FittedEffects,
-    HandEyeSolution,
-    hand_eye_jacobian,
-    solve_hand_eye,
-)
+from stitch.observations.surfaces.hand_eye_fit import FittedEffects, HandEyeSolution, hand_eye_jacobian, solve_hand_eye
 from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors

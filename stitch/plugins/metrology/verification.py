@@ -159,11 +159,9 @@ class Verification(Table, document="stitch.plugins.metrology.verification:verifi
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict for people, and what it rests on, one fact each."""
-        heading = {
-            True: "The artefact passes.",
-            False: "The artefact fails.",
-            None: "Pass or fail cannot be decided.",
-        }[self.passed]
+        heading = {True: "The artefact passes.", False: "The artefact fails.", None: "Pass or fail cannot be decided."}[
+            self.passed
+        ]
         facts = [heading, f"{self.agreeing} of {len(self.numbers)} calibrated numbers agree within U."]
         far = [n for n in self.numbers if abs(n.E_n) > n.E_n_limit]
         if far:

@@ -34,21 +34,9 @@ from stitch.session.reading.session_toml import (
     usual_guesses,
 )
 from stitch.session.reading.target_tables import read_frames, read_points, read_targets
-from stitch.session.reading.text_files import (
-    readable,
-    require_file,
-    table_choice,
-)
+from stitch.session.reading.text_files import readable, require_file, table_choice
 from stitch.session.reading.views_table import ViewRow, has_pose_columns, read_views, row_at
-from stitch.session.session import (
-    Cloud,
-    Mount,
-    NominalTargets,
-    Scanner,
-    SessionData,
-    Sighting,
-    View,
-)
+from stitch.session.session import Cloud, Mount, NominalTargets, Scanner, SessionData, Sighting, View
 from stitch.session.thinning import MAX_POINTS, distinct_points, points_within, thin_cloud
 from stitch.system.threads import parallel
 

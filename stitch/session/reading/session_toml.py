@@ -30,11 +30,7 @@ from stitch.session.reading.text_files import (
     table_choice,
 )
 from stitch.session.robot import Robot
-from stitch.session.session import (
-    Scanner,
-    SensorKind,
-    StatedRepeatability,
-)
+from stitch.session.session import Scanner, SensorKind, StatedRepeatability
 
 SESSION_FORMAT = "stitch-session/1"
 _KEYS = {

@@ -21,12 +21,7 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import mad_sigma
 from stitch.numerics.frames import Array
 from stitch.numerics.hand_eye import park_martin, shah, weight_roots
-from stitch.plugins.metrology.calibrate.hand_eye_report import (
-    hand_eye_document,
-    jackknife,
-    weak_components,
-    weak_notes,
-)
+from stitch.plugins.metrology.calibrate.hand_eye_report import hand_eye_document, jackknife, weak_components, weak_notes
 from stitch.session.reading.target_tables import read_frames
 from stitch.session.session import SessionData
 

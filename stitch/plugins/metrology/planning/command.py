@@ -30,8 +30,7 @@ _Folder = Annotated[
 ]
 _Views = Annotated[int | None, typer.Option("--views", metavar="N", help="Further views at the most.")]
 _Split = Annotated[
-    tuple[str, str] | None,
-    typer.Option("--split", metavar="EFFECT EFFECT", help="Views that tell these two apart."),
+    tuple[str, str] | None, typer.Option("--split", metavar="EFFECT EFFECT", help="Views that tell these two apart.")
 ]
 _Halve = Annotated[bool, typer.Option("--halve", help="Views that halve the hand-eye's uncertainty.")]
 _Feature = Annotated[
@@ -46,8 +45,7 @@ _Part = Annotated[
     Path | None, typer.Option("--part", metavar="MESH", help="The part: a mesh, or a cloud with normals.")
 ]
 _Size = Annotated[
-    float | None,
-    typer.Option("--size", metavar="MM", help="Longest side of a part of which nothing else is known."),
+    float | None, typer.Option("--size", metavar="MM", help="Longest side of a part of which nothing else is known.")
 ]
 _Field = Annotated[float | None, typer.Option("--field", metavar="DEG", help="Full angle of the scanner's field.")]
 _Start = Annotated[
