@@ -29,8 +29,7 @@ _NEGLIGIBLE_MOVE = 1e-6
 _KINDS = f"hand-eye: {', '.join(HAND_EYE)}; arm: {', '.join(ARM)}; cloud: {', '.join(CLOUD)}"
 _To = Annotated[str | None, typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.")]
 _Program = Annotated[
-    Path | None,
-    typer.Option("--program", metavar="FILE", help="Move the targets of a KUKA, FANUC, ABB or UR program."),
+    Path | None, typer.Option("--program", metavar="FILE", help="Move the targets of a KUKA, FANUC, ABB or UR program.")
 ]
 _Output = Annotated[
     Path | None, typer.Option("-o", "--output", metavar="FILE", help="File to write; texts: standard output.")

@@ -365,11 +365,7 @@ class CompensatedProgram:
 
 
 def compensated_program(
-    program: Program,
-    arm: ArmModel,
-    limit_mm: float = LIMIT_MM,
-    near: Array | None = None,
-    j2_in_j3: bool = False,
+    program: Program, arm: ArmModel, limit_mm: float = LIMIT_MM, near: Array | None = None, j2_in_j3: bool = False
 ) -> CompensatedProgram:
     """Return a program's copy with targets moved so that the true arm goes where the program meant.
 

@@ -151,9 +151,8 @@ def _session_of(found: FolderFiles, stated: StatedFolder) -> FirstSession:
     settled = choose_mounting(decided, stated.mount, stated.inverse)
     told = session_guesses(found, raw, decided, points, own_units, stated)
     told = tuple(_unit_of_pairs(guess, alike, stated) for guess in told) if len(alike) > 1 else told
-    beside = (*of_targets, *_codes_guess(clouds), *_left_out_guess(found, decided, lost))
-    guesses = (*told, settled.guess, axis_guess, *beside)
-    aside = _not_used(found, raw, decided, lost)
+    guesses = (*told, settled.guess, axis_guess, *of_targets)
+    aside = _not_used(found, raw, decided, [*lost, *_coded(clouds)])
     return FirstSession(
         found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box, not_used=aside
     )
@@ -171,7 +170,7 @@ def _not_used(files: FolderFiles, raw: RawPoses, decided: ConventionChoice, lost
     rows = [_row_words(raw, row) for row in range(len(raw.numbers)) if row not in pairing.rows]
     kept = covariate_columns(layout, range(len(raw.numbers)), raw.time_s)
     columns = [f"column {name}: counts or runs backwards" for name in layout.rest if not kept_column(name, kept)]
-    return (*lists, *others, *lost, *unposed, *rows, *columns)
+    return (*lost, *unposed, *lists, *others, *rows, *columns)
 
 
 def _row_words(raw: RawPoses, row: int) -> str:
@@ -364,25 +363,12 @@ def _in_another_unit(files: Sequence[Path], clouds: Sequence[Cloud]) -> dict[int
     return out
 
 
-def _codes_guess(clouds: Sequence[Cloud]) -> tuple[Guess, ...]:
+def _coded(clouds: Sequence[Cloud]) -> list[str]:
     """Return what share of the points was read as a code for nothing measured."""
     coded = sum(cloud.coded for cloud in clouds)
-    if not coded:
-        return ()
     share = coded / (coded + sum(cloud.count for cloud in clouds))
     codes = ", ".join(f"{code:g}" for code in sorted({code for cloud in clouds for code in cloud.codes}))
-    return (Guess("codes", codes, f"{share:.1%} of the points hold it: nothing was measured there", True, "clouds"),)
-
-
-def _left_out_guess(files: FolderFiles, decided: ConventionChoice, lost: Sequence[str]) -> tuple[Guess, ...]:
-    """Return what became of clouds and rows that hold nothing."""
-    pairing = decided.best.interpretation.pairing
-    unposed = [files.clouds[i].name for i, row in enumerate(pairing.rows) if row is None]
-    words = [*lost, *([f"no pose for {', '.join(unposed)}"] if unposed else [])]
-    if not words:
-        return ()
-    count = len(lost) + len(unposed)
-    return (Guess("left_out", f"{count} view{'s' * (count > 1)}", "; ".join(words), True, "views.csv"),)
+    return [f"{share:.1%} of the points, which hold {codes}: nothing was measured there"] * (coded > 0)
 
 
 # Factors between clouds and robot that a fitted scale is taken for, within this share.

@@ -6,6 +6,7 @@ that conventions and units which a format defines are told by the names: `x [mm]
 
 import re
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,26 +150,19 @@ def _tagged_lists(text: str) -> dict[str, list[PoseRow]]:
 
 _ROBTARGET = re.compile(rf"\[\s*{_list_of(3)}\s*,\s*{_list_of(4)}(?:\s*,\s*\[[^\]]*\])*\s*\]?")
 _UR_POSE = re.compile(rf"(?<!\w)p\s*{_list_of(6)}")
+_UR_NAMES = ("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]")
 _TF_ECHO = re.compile(rf"Translation:\s*{_list_of(3)}.*?Quaternion[^\[]*{_list_of(4)}", re.DOTALL)
 
 
-def _robtarget_rows(text: str) -> list[PoseRow]:
-    return _matched_rows(_ROBTARGET, text, ("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz"))
-
-
-def _ur_rows(text: str) -> list[PoseRow]:
-    return _matched_rows(_UR_POSE, text, ("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]"))
-
-
 def _tf_echo_rows(text: str) -> list[PoseRow]:
-    rows = _matched_rows(_TF_ECHO, text, ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"))
+    rows = _matched_rows(_TF_ECHO, ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"), text)
     times = _floats(re.findall(rf"At time ({_POINTED})", text))
     if len(times) == len(rows):
         return [((), {"time_s": time} | numbers) for time, (_, numbers) in zip(times, rows, strict=True)]
     return [((), numbers) for _, numbers in rows]
 
 
-def _matched_rows(pattern: re.Pattern[str], text: str, names: Sequence[str]) -> list[PoseRow]:
+def _matched_rows(pattern: re.Pattern[str], names: Sequence[str], text: str) -> list[PoseRow]:
     found = list(pattern.finditer(text))
     rows = [dict(zip(names, _floats(m.groups()), strict=True)) for m in found]
     return _labelled(text, [m.span() for m in found], rows) if found else []
@@ -268,7 +262,7 @@ _FORMATS: tuple[tuple[str, Callable[[str], list[PoseRow]]], ...] = (
     ("4×4 matrices with words between", _matrix_rows),
     ("images of COLMAP, inverted to T_world_camera", _colmap_rows),
     ("tf_echo of ROS", _tf_echo_rows),
-    ("robtargets of ABB", _robtarget_rows),
-    ("poses p[…] of Universal Robots", _ur_rows),
+    ("robtargets of ABB", partial(_matched_rows, _ROBTARGET, ("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz"))),
+    ("poses p[…] of Universal Robots", partial(_matched_rows, _UR_POSE, _UR_NAMES)),
     ("numbers behind their names", _keyed_rows),
 )

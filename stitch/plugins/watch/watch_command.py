@@ -26,8 +26,7 @@ def watch(
     add: Annotated[bool, typer.Option("--add", help="CELL RUN...: append runs to the history of the cell.")] = False,
     at: Annotated[str, typer.Option("--at", metavar="TIME", help="With --add RUN: when it was measured.")] = "",
     in_use: Annotated[
-        Path | None,
-        typer.Option("--in-use", metavar="RUN", help="Run whose calibration the cell uses from now on."),
+        Path | None, typer.Option("--in-use", metavar="RUN", help="Run whose calibration the cell uses from now on.")
     ] = None,
     tolerance: Annotated[
         float | None,

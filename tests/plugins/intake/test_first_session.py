@@ -165,7 +165,8 @@ def test_a_folder_becomes_the_session_of_its_campaign(tmp_path, campaign, name):
     first, out = made(tmp_path, name, campaign)
     assert kind_verdict(KINDS[name], campaign, out) == "right"
     assert first.choice.determined
-    lost = [guess for guess in first.guesses if guess.what == "left_out"]
+    scans = {file.name for file in tmp_path.rglob("*")}
+    lost = [words for words in first.not_used if Path(words.split(":")[0]).name in scans and "rows of" not in words]
     assert bool(lost) == bool(KINDS[name].views)
 
 
