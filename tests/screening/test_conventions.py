@@ -184,6 +184,20 @@ def test_a_rail_beside_the_poses_is_named_with_its_axis():
     assert "write y + 1000 * e1 in place of y" in found[0].hypothesis.fix
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.parametrize("along_lines", [False, True])
+def test_poses_that_lag_by_a_share_of_each_step_are_named_with_it(share, along_lines):
+    session, T_mount = cell_of("eye_in_hand")
+    T = np.array([view.T_base_flange for view in session.views])
+    steps = frames.log(frames.inverse(T[:-1]) @ T[1:])
+    lags = T.copy()
+    lags[1:] = T[:-1] @ frames.exp((1 - share) * steps)
+    if along_lines:
+        lags[1:, :3, 3] = T[:-1, :3, 3] + (1 - share) * (T[1:, :3, 3] - T[:-1, :3, 3])
+    found = proven_hypotheses(rank_hypotheses(with_poses(session, lags), motions(session, T_mount)))
+    assert f"lags its scan by {share:.0%}" in found[0].hypothesis.fix
+
+
 @pytest.mark.parametrize("scale", [1.0254, 0.97, 25.4, 1000.0, 0.001])
 def test_a_possible_factor_is_printed(scale):
     assert f"the clouds are {scale:.5g} times as large" in scale_text(scale)

@@ -63,6 +63,16 @@ def second_table(raw):
     (raw / "robot.txt").write_text((raw / "RobotPoses.dat").read_text().replace("0.", "0.1"))
 
 
+def test_what_is_only_guessed_is_known_to_the_session_until_a_person_states_otherwise(raw, tmp_path, capsys):
+    flags = "--rotation xyz-extrinsic --angles rad --unit mm --mount eye_to_hand --no-inverse --yes".split()
+    code, _, err = ended(capsys, "init", raw, *flags, "-o", tmp_path / "made")
+    assert code == 0, err
+    assert load_session(tmp_path / "made").usual["cloud_unit"] == "mm"
+    toml = tmp_path / "made" / "session.toml"
+    toml.write_text(toml.read_text().replace('cloud_unit = "mm"', 'cloud_unit = "cm"'))
+    assert "cloud_unit" not in load_session(tmp_path / "made", scans=False).usual
+
+
 def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path, capsys):
     clouds = [view.cloud.points for view in load_session(session).views]
     low, high = (np.quantile(np.concatenate(clouds), share, axis=0) for share in (0.1, 0.9))

@@ -310,3 +310,19 @@ def test_seconds_of_counts_in_whatever_a_controller_counts(tmp_path, name, times
     (tmp_path / "t.csv").write_text(f"{name},x,y,z,qx,qy,qz,qw\n{rows}", encoding="utf-8")
     (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
     assert [float(t) for t in covariate_columns(layout, [0, 1])["time_s"]] == pytest.approx([0, 1.5], abs=1e-5)
+
+
+def test_signs_exponents_and_units_of_other_programs_are_read(tmp_path):
+    (tmp_path / "t.txt").write_text("\u22121.5 2.5D+02 3.5\n1.5 \u22122.5d-1 3.5;\n", encoding="utf-8")
+    assert read_number_table(tmp_path / "t.txt").numbers.tolist() == [[-1.5, 250, 3.5], [1.5, -0.25, 3.5]]
+    (tmp_path / "t.csv").write_text("1.5 mm;2.5 mm;-3.5 mm\n4.5 mm;5.5 mm;6.5 mm\n")
+    assert read_number_table(tmp_path / "t.csv").numbers.tolist() == [[1.5, 2.5, -3.5], [4.5, 5.5, 6.5]]
+
+
+def test_a_text_that_ends_within_its_last_number_loses_that_row(tmp_path):
+    rows = "1.125 2.125 3.125\n" * 4
+    (tmp_path / "t.txt").write_text(f"{rows}1.125 2.125 3.1")
+    table = read_number_table(tmp_path / "t.txt")
+    assert len(table.numbers) == 4 and "the last row is cut short" in table.words
+    (tmp_path / "t.txt").write_text(f"{rows}1.125 2.125 3.1\n")
+    assert len(read_number_table(tmp_path / "t.txt").numbers) == 5

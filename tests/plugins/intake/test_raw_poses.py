@@ -392,3 +392,35 @@ def test_children_of_elements_of_xml_are_numbers_by_their_names(tmp_path):
     rows = "".join(f"<pose name='s{i}'><x>{i}</x><y>2</y><z>3</z><q>0 0.6 0 0.8</q></pose>" for i in range(3))
     raw = read(tmp_path, "poses.xml", f"<?xml version='1.0'?><poses>{rows}</poses>")
     assert raw.numbers.shape == (3, 7) and raw.labels[1] == ("s1",)
+
+
+def test_rotations_and_positions_in_lists_of_their_own_are_one_list(tmp_path):
+    R = Rotation.random(4, np.random.default_rng(3)).as_matrix()
+    t = np.arange(12.0).reshape(4, 3)
+    np.savez(tmp_path / "calib.npz", R_gripper2base=R, t_gripper2base=t[:, :, None])
+    joined = read_lists(tmp_path / "calib.npz")[0]
+    assert joined.part == "R_gripper2base+t_gripper2base"
+    assert np.array_equal(joined.numbers, np.hstack([R.reshape(4, 9), t]))
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_an_axis_and_an_angle_in_a_table_are_a_vector_of_rotation(tmp_path, unit):
+    vectors = Rotation.random(4, np.random.default_rng(4)).as_rotvec()
+    angle = np.linalg.norm(vectors, axis=1, keepdims=True)
+    shown = np.degrees(angle) if unit == "deg" else angle
+    rows = np.hstack([np.arange(12.0).reshape(4, 3), vectors / angle, shown])
+    head = f"x,y,z,axis_x,axis_y,axis_z,angle_{unit}"
+    np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header=head, comments="", fmt="%.12f")
+    raw = read_lists(tmp_path / "t.csv")[0]
+    assert raw.header[-3:] == ("rvx [rad]", "rvy [rad]", "rvz [rad]") and np.allclose(raw.numbers[:, 3:], vectors)
+
+
+def test_matlabs_cells_and_arrays_of_structs_are_lists(tmp_path):
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, :3, 3] = np.arange(9.0).reshape(3, 3)
+    cells = np.empty(3, object)
+    cells[:] = list(T)
+    savemat(tmp_path / "cells.mat", {"Hg": cells})
+    assert np.array_equal(read_lists(tmp_path / "cells.mat")[0].numbers, T.reshape(3, 16))
+    savemat(tmp_path / "structs.mat", {"pose": np.array([{"R": M[:3, :3], "t": M[:3, 3]} for M in T])})
+    assert read_lists(tmp_path / "structs.mat")[0].numbers[:, 9:].tolist() == T[:, :3, 3].tolist()

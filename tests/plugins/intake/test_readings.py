@@ -7,6 +7,7 @@ import csv
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_synth.write import write_session
 from stitch.errors import InputError
@@ -14,7 +15,14 @@ from stitch.output.urdf_file import to_urdf
 from stitch.plugins.intake.first_session import first_session
 from stitch.plugins.intake.layouts import ColumnLayout
 from stitch.plugins.intake.raw_poses import RawPoses, read_raw_poses
-from stitch.plugins.intake.readings import StatedTable, all_readings, mixed_readings, readings, rotation_conventions
+from stitch.plugins.intake.readings import (
+    StatedTable,
+    all_readings,
+    mixed_readings,
+    readings,
+    rotation_conventions,
+    with_uncoupled_joints,
+)
 from stitch.plugins.intake.session_draft import write_draft
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.session_folder import load_session
@@ -116,3 +124,17 @@ def test_the_scans_tell_the_unit_of_joint_angles_and_the_mount(cell, tmp_path):
     for a, b in zip(made.views, session.views, strict=True):
         assert np.allclose(a.joints, b.joints, atol=1e-8) and np.abs(a.T_base_flange - b.T_base_flange).max() < 1e-3
     assert [view.time_s for view in made.views] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("sign", "words"), [(-1.0, "j3 is j3 + j2"), (1.0, "j3 is j3 - j2"), (0.0, "")])
+def test_joints_beside_poses_are_counted_as_the_poses_turn(cell, sign, words):
+    session, raw = cell
+    T = np.array([view.T_base_flange for view in session.views])
+    shown = np.array([view.joints for view in session.views])
+    shown[:, 2] += sign * shown[:, 1]
+    header = (*(f"{axis} [mm]" for axis in "xyz"), "qx", "qy", "qz", "qw", *(f"j{i} [rad]" for i in range(1, 7)))
+    numbers = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(), shown])
+    (reading,) = all_readings(RawPoses("t", header, numbers, ((),) * len(T), ""), None, StatedTable())
+    found = with_uncoupled_joints(reading, raw / "arm.urdf").layout
+    assert np.allclose(found.joints, [view.joints for view in session.views]) and words in found.words
+    assert bool(words) == ("turns as the poses" in found.words)
