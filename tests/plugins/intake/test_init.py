@@ -64,13 +64,14 @@ def second_table(raw):
 
 
 def test_what_is_only_guessed_is_known_to_the_session_until_a_person_states_otherwise(raw, tmp_path, capsys):
-    flags = "--rotation xyz-extrinsic --angles rad --unit mm --mount eye_to_hand --no-inverse --yes".split()
-    code, _, err = ended(capsys, "init", raw, *flags, "-o", tmp_path / "made")
-    assert code == 0, err
-    assert load_session(tmp_path / "made").usual["cloud_unit"] == "mm"
+    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", "-o", tmp_path / "made")
+    assert code == 0 and load_session(tmp_path / "made").usual == {}, err
     toml = tmp_path / "made" / "session.toml"
+    guessed = "# ? cloud_unit: mm; scans are 150 long\n# ? rotation: xyz-extrinsic, radians; told by\n"
+    toml.write_text(guessed + toml.read_text())
+    assert load_session(tmp_path / "made").usual == {"cloud_unit": "mm", "rotation": "xyz-extrinsic"}
     toml.write_text(toml.read_text().replace('cloud_unit = "mm"', 'cloud_unit = "cm"'))
-    assert "cloud_unit" not in load_session(tmp_path / "made", scans=False).usual
+    assert load_session(tmp_path / "made", scans=False).usual == {"rotation": "xyz-extrinsic"}
 
 
 def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path, capsys):
