@@ -1,8 +1,9 @@
 """Twenty errors of a cell by physics, written down by somebody who had not read the library of effects.
 
-Each law says where the error lives, what it follows, and how large it usually is. Half of them stand in textbooks, half
-need not. A law acts on a cell of `bench/outside_world.py`: it adds to the motions of a place in each view, or to the
-ranges of the scanner. Lengths in mm, angles in rad, temperatures in degrees Celsius, a twist is (rotation, translation).
+Each law says where the error lives, what it follows, and how large it usually is. Half of them stand in textbooks,
+half need not. A law acts on a cell of `bench/outside_world.py`: it adds to the motions of a place in each view, or to
+the ranges of the scanner. Lengths in mm, angles in rad, temperatures in degrees Celsius, a twist is (rotation,
+translation).
 """
 
 from collections.abc import Callable
@@ -34,7 +35,7 @@ def _pedestal(cell: Cell, size: float, rng: np.random.Generator) -> int:
     return 0
 
 
-def _press_next_door(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _press(cell: Cell, size: float, rng: np.random.Generator) -> int:
     direction, period = rng.uniform(0, 2 * np.pi), rng.uniform(400, 900)
     wave = size * np.sin(2 * np.pi * cell.time / period + rng.uniform(0, 2 * np.pi))
     cell.base[:, :2] += wave[:, None] * [np.cos(direction), np.sin(direction)]
@@ -141,7 +142,7 @@ def _clamp(cell: Cell, size: float, rng: np.random.Generator) -> int:
 
 
 def _bowl(cell: Cell, size: float, rng: np.random.Generator) -> int:
-    edge = cell.field**2
+    edge = cell.edge**2
     cell.ranges.append(lambda p, cosine: size * (p[..., 0] ** 2 + p[..., 1] ** 2) / p[..., 2] ** 2 / edge)
     return 0
 
@@ -167,29 +168,27 @@ def _nothing(cell: Cell, size: float, rng: np.random.Generator) -> int:
 
 
 LAWS = {
-    "a pedestal grows with the room's temperature": Law(
-        "base", "ambient_temperature_c", 9.2e-3, "mm/K, steel of 0.8 m", True, _pedestal
+    "pedestal grows with the room": Law(
+        "base", "ambient_temperature_c", 9.2e-3, "mm/K, 0.8 m of steel", True, _pedestal
     ),
-    "a press next door rocks the base": Law("base", "time_s", 4e-5, "rad, amplitude in 400 to 900 s", False, _press_next_door),
-    "a joint gives way to the load": Law("joint", "gravity", 1e-4, "rad at the arm's largest static torque", True, _spring),
-    "a code disc sits off its centre": Law("joint", "own angle", 5e-5, "rad, amplitude once a turn", True, _code_disc),
-    "a gear has play": Law("joint", "approach", 1e-4, "rad, lost motion", True, _backlash),
-    "poses are read late while the arm moves": Law("joint", "velocity", 1e-3, "s", True, _late_clock),
-    "joint 5 turns joint 6 with it": Law("joint", "j5_deg", 1.5e-4, "rad/rad", False, _wrist_coupling),
-    "a brake falls in after a long wait": Law("joint", "wait_s", 6e-5, "rad from 15 s on", False, _brake),
-    "a coupling creeps in behind a move": Law(
-        "joint", "move, wait_s", 2e-4, "rad for 1 rad of way, fading in 8 s", False, _creeps_in
-    ),
+    "press next door rocks the base": Law("base", "time_s", 4e-5, "rad, in waves of 400 to 900 s", False, _press),
+    "joint gives way to the load": Law("joint", "gravity", 1e-4, "rad at the largest static torque", True, _spring),
+    "code disc off its centre": Law("joint", "own angle", 5e-5, "rad, once a turn", True, _code_disc),
+    "play in a gear": Law("joint", "approach", 1e-4, "rad, lost motion", True, _backlash),
+    "poses read late in motion": Law("joint", "velocity", 5e-4, "s", True, _late_clock),
+    "joint 5 turns joint 6": Law("joint", "j5_deg", 3e-4, "rad/rad", False, _wrist_coupling),
+    "brake falls in after a wait": Law("joint", "wait_s", 6e-5, "rad from 15 s on", False, _brake),
+    "coupling creeps in behind a move": Law("joint", "move, wait_s", 2e-4, "rad/rad, fading in 8 s", False, _creeps_in),
     "one link grows warm": Law("link", "robot_temperature_c", 1.15e-5, "1/K of its length", True, _warm_link),
-    "the adapter at the flange droops": Law("mount", "gravity", 8e-5, "rad, horizontal", True, _droop),
-    "a hose pulls once it is taut": Law("mount", "j6_deg", 1.5e-4, "rad at the end of the range", False, _hose),
-    "a loose bolt has two seats": Law("mount", "gravity", 0.04, "mm, from the middle to a seat", False, _loose_bolt),
-    "the scanner is knocked": Law("scanner", "view", 0.08, "mm, and 1.5 mrad for a mm", True, _knock),
-    "glue creeps under the part": Law("part", "time_s", 0.08, "mm over the session, as a logarithm", False, _glue),
-    "the clamp follows the air supply": Law("part", "supply_pressure_bar", 0.25, "mm/bar", False, _clamp),
-    "the field of the scanner is a bowl": Law("scanner", "field", 0.03, "mm at the field's edge", True, _bowl),
-    "steep surfaces look farther": Law("scanner", "incidence", 0.025, "mm at 60 degrees", False, _steep, clouds_only=True),
-    "the scanner's axis drifts as it warms": Law("scanner", "scanner_temperature_c", 2e-5, "rad/K", True, _warm_scanner),
-    "near and far are seen too far": Law("scanner", "distance", 0.025, "mm at 50 mm from the middle", False, _far_and_near),
+    "adapter droops at the flange": Law("mount", "gravity", 2e-4, "rad where horizontal", True, _droop),
+    "hose pulls once it is taut": Law("mount", "j6_deg", 3e-4, "rad at the end of the range", False, _hose),
+    "loose bolt with two seats": Law("mount", "gravity", 0.04, "mm from the middle to a seat", False, _loose_bolt),
+    "scanner is knocked": Law("scanner", "view", 0.08, "mm, and 1.5 mrad for a mm", True, _knock),
+    "glue creeps under the part": Law("part", "time_s", 0.08, "mm over the session, a logarithm", False, _glue),
+    "clamp follows the air supply": Law("part", "supply_pressure_bar", 0.25, "mm/bar", False, _clamp),
+    "field of the scanner is a bowl": Law("scanner", "field", 0.05, "mm at the field's edge", True, _bowl),
+    "steep surfaces look farther": Law("scanner", "incidence", 0.025, "mm at 60 degrees", False, _steep, True),
+    "scanner's axis drifts as it warms": Law("scanner", "scanner_temperature_c", 4e-5, "rad/K", True, _warm_scanner),
+    "near and far look farther": Law("scanner", "distance", 0.025, "mm at 50 mm from the middle", False, _far_and_near),
     "nothing": Law("", "", 0.0, "", True, _nothing),
-}  # fmt: skip
+}
