@@ -192,3 +192,18 @@ LAWS = {
     "near and far look farther": Law("scanner", "distance", 0.025, "mm at 50 mm from the middle", False, _far_and_near),
     "nothing": Law("", "", 0.0, "", True, _nothing),
 }
+
+# Written once the laws were fixed: the library's effects that are one of them by another name.
+NAMES = {
+    "joint gives way to the load": ("joint_compliance",),
+    "code disc off its centre": ("gear_eccentricity",),
+    "play in a gear": ("backlash",),
+    "poses read late in motion": ("latency",),
+    "coupling creeps in behind a move": ("settling",),
+    "one link grows warm": ("robot_thermal_growth",),
+    "adapter droops at the flange": ("mount_droop", "mount_bend", "fixture_droop", "fixture_bend"),
+    "scanner is knocked": ("mount_step",),
+    "field of the scanner is a bowl": ("field_curvature",),
+    "steep surfaces look farther": ("incidence_bias",),
+    "near and far look farther": ("range_nonlinearity",),
+}

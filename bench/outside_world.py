@@ -79,6 +79,13 @@ class Cell:
             self.torques[:, joint] = (moment * links[0][joint][:, :3, 2]).sum(1)
         self.largest_torque = np.array([(masses[k:] * 9.81e-3).sum() * 600 for k in range(6)])
 
+    def scanner_seen(self) -> Array:
+        """Return what the hand-eye would be in each view (V, 4, 4) to whoever takes the reported poses as true."""
+        reported, true = forward(self.arm, self.q)[0], forward(self.arm, self.q + self.joints, self.links)[0]
+        if self.eye_in_hand:
+            return np.linalg.inv(reported) @ true @ motion(self.mount) @ self.hand_eye @ motion(self.stand)
+        return reported @ np.linalg.inv(motion(self.base) @ true) @ self.hand_eye @ motion(self.stand)
+
     def scanner_part(self) -> Array:
         """Return T_scanner_part (V, 4, 4) as it is, with all errors."""
         flange = motion(self.base) @ forward(self.arm, self.q + self.joints, self.links)[0] @ motion(self.mount)
@@ -276,9 +283,10 @@ def scan(cell: Cell, pose: Array, noise: float, rng: np.random.Generator) -> tup
 def hide(cell: Cell, law: Law, times: float, rng: np.random.Generator) -> SimpleNamespace:
     """Put geometry, law and scatter into the cell; return what is true of it.
 
-    The true hand-eye is the one at the mean of all errors but the scatter: what the best linear estimate over these
-    views, which knows the scatter's covariance, makes of them in hand-eye and place of the part. `visible` is what that
-    leaves of the law, rms of a place in mm.
+    The true hand-eye without a model is the one at the mean of all errors but the scatter: what the best linear
+    estimate over these views, which knows the scatter's covariance, makes of them in hand-eye and place of the part.
+    `visible` is what that leaves of the law, rms of a place in mm. Beside a model of the law it is moved by what the law
+    does between the reported flange and the scanner, in the mean or in the last view; part and optics do not move it.
     """
     directions = rng.standard_normal((12, 3))
     directions[:, 2] = np.abs(directions[:, 2])
@@ -286,7 +294,7 @@ def hide(cell: Cell, law: Law, times: float, rng: np.random.Generator) -> Simple
     body = directions / (1 + surface(directions))[:, None]
     perfect = _as_seen(cell, body)
     _give_geometry(cell, body, rng)
-    without = _as_seen(cell, body)
+    without, still = _as_seen(cell, body), cell.scanner_seen()
     where = law.act(cell, law.size * times, rng)
     seen = _as_seen(cell, body)
     by_joint = []
@@ -307,8 +315,14 @@ def hide(cell: Cell, law: Law, times: float, rng: np.random.Generator) -> Simple
     shifts = np.stack([(seen - start).reshape(views, -1) for start in (perfect, without)], -1)
     best = np.linalg.lstsq((whiten @ jacobian).reshape(-1, 12), (whiten @ shifts).reshape(-1, 2), rcond=None)[0]
     visible = _rms((shifts - jacobian @ best)[..., 1].reshape(views, -1, 3))
+    moving = np.linalg.inv(cell.hand_eye) @ (cell.scanner_seen() - still)
+    turning = (moving - moving.swapaxes(1, 2))[:, (2, 0, 1), (1, 2, 0)] / 2
+    shifting = np.c_[turning, moving[:, :3, 3]]
     cell.joints += rng.standard_normal(cell.q.shape) * size * [1, 1, 1, 2, 2, 2]
-    return SimpleNamespace(where=where, hand_eye=cell.hand_eye @ motion(best[:6, 0]), visible=visible, scatter=scatter)
+    geometry = best[:6, 0] - best[:6, 1]
+    twists = {"plain": best[:6, 0], "mean": geometry + shifting.mean(0), "last": geometry + shifting[-1]}
+    poses = {name: cell.hand_eye @ motion(twist) for name, twist in twists.items()} | {"nominal": cell.hand_eye}
+    return SimpleNamespace(where=where, poses=poses, visible=visible, scatter=scatter)
 
 
 def _give_geometry(cell: Cell, body: Array, rng: np.random.Generator) -> None:

@@ -52,6 +52,7 @@ TABLES = {
     "no-mistake": "integrity:GOOD",
     "odd": "odd:TABLE",
     "ordinary-arms": "hand_eye_sigmas:ORDINARY_ARMS",
+    "outside-cells": "outside_cells:TABLE",
     "panel": "panel:TABLE",
     "peers": "speed:PEERS",
     "points-names": "points:NAMES",
