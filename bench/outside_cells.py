@@ -75,7 +75,7 @@ def trial(job: Row) -> Row:
         try:
             run = stitch.run(stitch.load_session(Path(folder) / "cell"))
             diagnosis = stitch.diagnose(run)
-            better, lines, last = suggest(run, 5)
+            better, lines, last = suggest(run, 5) if diagnosis.together else (None, [], diagnosis)
         except (stitch.InputError, stitch.NoResultError) as error:
             return row | {"refused": str(error)}
     found = diagnosis.to_dict()

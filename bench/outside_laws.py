@@ -8,13 +8,13 @@ translation).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from bench.outside_world import FIELD, Cell
+
 # Gears and encoders of a wrist are smaller, and worse by this factor.
 WRIST = 2.5
-Cell = Any  # of bench/outside_world.py
 
 
 @dataclass(frozen=True)
@@ -26,26 +26,23 @@ class Law:
     size: float  # usual
     unit: str  # of the size, with what it is the size of
     textbook: bool
-    act: Callable[[Cell, float, np.random.Generator], int]  # the law in the cell; which joint or view, 0: none
+    act: Callable[[Cell, float, np.random.Generator], int | None]  # the law in the cell; which joint, link or view
     clouds_only: bool = False
 
 
-def _pedestal(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _pedestal(cell: Cell, size: float, rng: np.random.Generator) -> None:
     cell.base[:, 5] += size * (cell.columns["ambient_temperature_c"] - 20)
-    return 0
 
 
-def _press(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _press(cell: Cell, size: float, rng: np.random.Generator) -> None:
     direction, period = rng.uniform(0, 2 * np.pi), rng.uniform(400, 900)
     wave = size * np.sin(2 * np.pi * cell.time / period + rng.uniform(0, 2 * np.pi))
     cell.base[:, :2] += wave[:, None] * [np.cos(direction), np.sin(direction)]
-    return 0
 
 
 def _spring(cell: Cell, size: float, rng: np.random.Generator) -> int:
     joint = int(rng.integers(2, 4))
-    torque = cell.torques[:, joint - 1]
-    cell.joints[:, joint - 1] += size * torque / cell.largest_torque[joint - 1]
+    cell.joints[:, joint - 1] += size * cell.torques[:, joint - 1]
     return joint
 
 
@@ -66,9 +63,8 @@ def _backlash(cell: Cell, size: float, rng: np.random.Generator) -> int:
     return joint
 
 
-def _late_clock(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _late_clock(cell: Cell, size: float, rng: np.random.Generator) -> None:
     cell.joints += size * cell.velocities
-    return 0
 
 
 def _wrist_coupling(cell: Cell, size: float, rng: np.random.Generator) -> int:
@@ -96,11 +92,10 @@ def _warm_link(cell: Cell, size: float, rng: np.random.Generator) -> int:
     return link
 
 
-def _droop(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _droop(cell: Cell, size: float, rng: np.random.Generator) -> None:
     down = cell.down_in_flange
     cell.mount[:, :3] += size * np.cross([0, 0, 1], down)
     cell.mount[:, 3:5] += size * 40 * down[:, :2]
-    return 0
 
 
 def _hose(cell: Cell, size: float, rng: np.random.Generator) -> int:
@@ -110,12 +105,11 @@ def _hose(cell: Cell, size: float, rng: np.random.Generator) -> int:
     return 6
 
 
-def _loose_bolt(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _loose_bolt(cell: Cell, size: float, rng: np.random.Generator) -> None:
     seat = np.sign(cell.down_in_flange[0, 1])
     for view, side in enumerate(cell.down_in_flange[:, 1]):
         seat = np.sign(side) if abs(side) > 0.15 else seat
         cell.mount[view] += seat * size * np.array([0, 0, 1.5e-3, 0, 1, 0])
-    return 0
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
@@ -130,41 +124,31 @@ def _knock(cell: Cell, size: float, rng: np.random.Generator) -> int:
     return first
 
 
-def _glue(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _glue(cell: Cell, size: float, rng: np.random.Generator) -> None:
     way = np.log1p(cell.time / 60) / np.log1p(cell.time[-1] / 60)
     cell.part[:, 3:] += size * way[:, None] * _direction(rng)
-    return 0
 
 
-def _clamp(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _clamp(cell: Cell, size: float, rng: np.random.Generator) -> None:
     cell.part[:, 3:] += size * (cell.columns["supply_pressure_bar"][:, None] - 6) * _direction(rng)
-    return 0
 
 
-def _bowl(cell: Cell, size: float, rng: np.random.Generator) -> int:
-    edge = cell.edge**2
+def _bowl(cell: Cell, size: float, rng: np.random.Generator) -> None:
+    edge = FIELD**2
     cell.ranges.append(lambda p, cosine: size * (p[..., 0] ** 2 + p[..., 1] ** 2) / p[..., 2] ** 2 / edge)
-    return 0
 
 
-def _steep(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _steep(cell: Cell, size: float, rng: np.random.Generator) -> None:
     cell.ranges.append(lambda p, cosine: size * (1 / cosine - 1))
-    return 0
 
 
-def _warm_scanner(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _warm_scanner(cell: Cell, size: float, rng: np.random.Generator) -> None:
     warm = cell.columns["scanner_temperature_c"] - 30
     cell.stand += size * warm[:, None] * [0, 1, 0, 200, 0, 0]
-    return 0
 
 
-def _far_and_near(cell: Cell, size: float, rng: np.random.Generator) -> int:
+def _far_and_near(cell: Cell, size: float, rng: np.random.Generator) -> None:
     cell.ranges.append(lambda p, cosine: size * ((p[..., 2] - 400) / 50) ** 2)
-    return 0
-
-
-def _nothing(cell: Cell, size: float, rng: np.random.Generator) -> int:
-    return 0
 
 
 LAWS = {
@@ -190,7 +174,7 @@ LAWS = {
     "steep surfaces look farther": Law("scanner", "incidence", 0.025, "mm at 60 degrees", False, _steep, True),
     "scanner's axis drifts as it warms": Law("scanner", "scanner_temperature_c", 4e-5, "rad/K", True, _warm_scanner),
     "near and far look farther": Law("scanner", "distance", 0.025, "mm at 50 mm from the middle", False, _far_and_near),
-    "nothing": Law("", "", 0.0, "", True, _nothing),
+    "nothing": Law("", "", 0.0, "", True, lambda cell, size, rng: None),
 }
 
 # Written once the laws were fixed: the library's effects that are one of them by another name.

@@ -5,6 +5,7 @@ its scatter and a little geometry of its own; labelled balls or the scans of a b
 a user has: joint angles and the columns that a cell records. Lengths in mm, angles in rad.
 """
 
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,35 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from bench.outside_laws import Law
-
 Array = np.ndarray
-# Rows: a, alpha (degrees), d, mass in kg, centre of mass in the link's own frame.
+# Rows: a, alpha (degrees), d, mass (kg), and the centre of mass in the link's own frame.
+_OFFSET = """0 90 181 7.4 0 -20 3; -613 0 0 13 290 0 160; -572 0 0 4.1 250 0 50; 0 90 174 2.1 0 -18 6; 0 -90 120 2 0 18 6;
+ 0 0 117 0.6 0 0 -25"""
+_SPHERICAL = """260 -90 675 60 -120 90 0; 680 0 0 40 -330 0 60; 35 -90 0 35 0 0 40; 0 90 670 12 0 -150 0; 0 -90 0 5 0 0 10;
+ 0 0 158 1.5 0 0 -30"""
 ARMS = {
-    "offset wrist": [
-        (0, 90, 181, 7.4, (0, -20, 3)),
-        (-613, 0, 0, 13.0, (290, 0, 160)),
-        (-572, 0, 0, 4.1, (250, 0, 50)),
-        (0, 90, 174, 2.1, (0, -18, 6)),
-        (0, -90, 120, 2.0, (0, 18, 6)),
-        (0, 0, 117, 0.6, (0, 0, -25)),
-    ],
-    "spherical wrist": [
-        (260, -90, 675, 60, (-120, 90, 0)),
-        (680, 0, 0, 40, (-330, 0, 60)),
-        (35, -90, 0, 35, (0, 0, 40)),
-        (0, 90, 670, 12, (0, -150, 0)),
-        (0, -90, 0, 5, (0, 0, 10)),
-        (0, 0, 158, 1.5, (0, 0, -30)),
-    ],
+    name: np.array([row.split() for row in table.split(";")], float)
+    for name, table in (("offset wrist", _OFFSET), ("spherical wrist", _SPHERICAL))
 }
-GRAVITY = np.array([0, 0, -9.81])
 FIELD = np.tan(np.radians(18))
 STANDOFF = (355, 445)
 SEMI_AXES = np.array([85, 65, 50])
 RAYS = 78  # a side of the scanner's grid
 STEEPEST = np.cos(np.radians(65))
 SCATTER = 0.02  # rms displacement at the part of an ordinary arm
+SHARES = np.array([1, 1, 1, 2, 2, 2])  # of the joints in it
 GEOMETRY = 0.02  # the same of its lengths and zeros, most of it without effect on the scans
 
 
@@ -56,8 +45,7 @@ class Cell:
     time: Array
     moves: Array  # (V, 6) from where each joint came
     velocities: Array
-    columns: dict[str, Array]
-    edge: float = FIELD
+    columns: dict[str, Any]
     ranges: list[Any] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -65,19 +53,15 @@ class Cell:
         views = len(self.q)
         self.base, self.mount, self.stand, self.part, self.joints = (np.zeros((views, 6)) for _ in range(5))
         self.links = np.zeros((6, views, 6))
-        _, points, _, _ = chain(self.arm)
-        self.link_vectors = np.vstack([np.diff(points, axis=0), np.zeros(3)])
+        self.link_vectors = np.diff(chain(self.arm)[:, :3, 3], axis=0)
         flange, links = forward(self.arm, self.q)
         self.down_in_flange = -flange[:, 2, :3]
-        centres = np.array([[*row[4], 1.0] for row in ARMS[self.arm]])
-        masses = np.array([row[3] for row in ARMS[self.arm]])
-        places = np.einsum("kvij,kj->kvi", links[1], centres)[..., :3]
+        weights = ARMS[self.arm][:, 3] * 9.81e-3
+        places = np.einsum("kvij,kj->kvi", links[1], np.c_[ARMS[self.arm][:, 4:], np.ones(6)])[..., :3]
         self.torques = np.zeros((views, 6))
-        for joint in range(6):
-            lever = places[joint:] - links[0][joint][:, :3, 3]
-            moment = np.cross(lever, masses[joint:, None, None] * GRAVITY * 1e-3).sum(0)
-            self.torques[:, joint] = (moment * links[0][joint][:, :3, 2]).sum(1)
-        self.largest_torque = np.array([(masses[k:] * 9.81e-3).sum() * 600 for k in range(6)])
+        for joint, frame in enumerate(links[0]):
+            moment = np.cross(places[joint:] - frame[:, :3, 3], weights[joint:, None, None] * [0, 0, -1]).sum(0)
+            self.torques[:, joint] = (moment * frame[:, :3, 2]).sum(1) / (weights[joint:].sum() * 600)
 
     def scanner_seen(self) -> Array:
         """Return what the hand-eye would be in each view (V, 4, 4) to whoever takes the reported poses as true."""
@@ -111,29 +95,26 @@ def motion(twist: Array) -> Array:
     return result
 
 
-def chain(arm: str) -> tuple[Array, Array, Array, Array]:
-    """Return axes (6, 3), points on them (6, 3), frames of the links (6, 4, 4) and the flange (4, 4), all at zero."""
+def chain(arm: str) -> Array:
+    """Return the frames (7, 4, 4) of base and links with all joints at zero; joint k turns about z of frame k."""
     frames = [np.eye(4)]
-    for a, alpha, d, _, _ in ARMS[arm]:
+    for a, alpha, d in ARMS[arm][:, :3]:
         cosine, sine = np.cos(np.radians(alpha)), np.sin(np.radians(alpha))
         frames.append(frames[-1] @ [[1, 0, 0, a], [0, cosine, -sine, 0], [0, sine, cosine, d], [0, 0, 0, 1]])
-    at = np.array(frames)
-    return at[:-1, :3, 2], at[:-1, :3, 3], at[1:], at[-1]
+    return np.array(frames)
 
 
-def forward(arm: str, q: Array, links: Array | None = None) -> tuple[Array, tuple[Array, Array]]:
-    """Return T_base_flange (V, 4, 4), and the frames before and behind each joint (6, V, 4, 4)."""
-    axes, points, frames, flange = chain(arm)
+def forward(arm: str, q: Array, links: Array | None = None) -> tuple[Array, Array]:
+    """Return T_base_flange (V, 4, 4), and the frames before and behind each joint (2, 6, V, 4, 4)."""
+    frames = chain(arm)
     pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    start = [np.eye(4), *frames[:-1]]
-    before, behind = [], []
-    for joint, (axis, point) in enumerate(zip(axes, points, strict=True)):
-        before.append(pose @ start[joint])
-        pose = pose @ motion(q[:, joint, None] * np.r_[axis, np.cross(point, axis)])
-        behind.append(pose @ frames[joint])
-        if links is not None:
-            pose = pose @ motion(links[joint])
-    return pose @ flange, (np.array(before), np.array(behind))
+    passed = []
+    for joint, (start, end) in enumerate(itertools.pairwise(frames)):
+        axis = np.r_[start[:3, 2], np.cross(start[:3, 3], start[:3, 2])]
+        before, pose = pose @ start, pose @ motion(q[:, joint, None] * axis)
+        passed.append((before, pose @ end))
+        pose = pose if links is None else pose @ motion(links[joint])
+    return pose @ frames[-1], np.array(passed).swapaxes(0, 1)
 
 
 def reach(arm: str, wanted: Array, start: Array) -> tuple[Array, Array]:
@@ -158,46 +139,42 @@ def reach(arm: str, wanted: Array, start: Array) -> tuple[Array, Array]:
 def looks(rng: np.random.Generator, count: int) -> Array:
     """Return T_scanner_part (count, 4, 4): the part seen from within 50 degrees of its z axis, at any roll."""
     turn, tilt = rng.uniform(0, 2 * np.pi, count), np.arccos(rng.uniform(np.cos(np.radians(50)), 1, count))
-    roll = rng.uniform(-1.8, 1.8, count)
-    axis = np.c_[np.cos(turn) * tilt, np.sin(turn) * tilt, 0 * turn]
-    about_z = np.c_[0 * roll, 0 * roll, roll]
     still = np.zeros((count, 3))
-    pose = motion(np.c_[axis, still]) @ motion(np.c_[about_z, still])
+    roll = motion(np.c_[still[:, :2], rng.uniform(-1.8, 1.8, count), still])
+    leaning = motion(np.c_[np.cos(turn) * tilt, np.sin(turn) * tilt, still, still[:, 0]])
     # The scanner's z axis looks at the part, whose z axis looks back.
-    facing = np.diag([1.0, -1, -1, 1]) @ pose.swapaxes(1, 2)
-    facing[:, :3, 3] = np.c_[rng.uniform(-15, 15, (count, 2)), rng.uniform(*STANDOFF, count)]
-    facing[:, 3, :3] = 0
+    facing = np.diag([1.0, -1, -1, 1]) @ (leaning @ roll).swapaxes(1, 2)
+    facing[:, :3, 3] = np.c_[rng.uniform(-15, 15, (count, 2)), rng.uniform(355, 445, count)]
     return facing
 
 
-def rotation(*rotation_vector: float) -> Array:
-    """Return a pose (4, 4) that turns."""
-    return motion(np.r_[rotation_vector, 0, 0, 0])
+def placed(turn: Any, low: list[float], high: list[float], rng: np.random.Generator) -> Array:
+    """Return a pose (4, 4) of a rotation vector, somewhere between two corners."""
+    pose = motion(np.r_[turn, 0, 0, 0])
+    pose[:3, 3] = rng.uniform(low, high)
+    return pose
 
 
 def build(kind: str, on_the_fly: bool, rng: np.random.Generator) -> Cell:
     """Return a cell whose views a user would take, without any error."""
     eye_in_hand = bool(rng.random() < 0.55)
-    tilt = rotation(*rng.uniform(-0.3, 0.3, 3))
-    shift = np.eye(4)
+    tilt = rng.uniform(-0.3, 0.3, 3)
     for _ in range(50):
         arm = str(rng.choice(list(ARMS)))
         if eye_in_hand:
-            shift[:3, 3] = rng.uniform([-60, 40, 60], [60, 120, 140])
-            hand_eye = shift @ tilt
-            part_pose = rotation(*rng.uniform(-0.2, 0.2, 3))
-            part_pose[:3, 3] = rng.uniform([650, -250, 0], [850, 250, 200])
+            hand_eye = placed(tilt, [-60, 40, 60], [60, 120, 140], rng)
+            part_pose = placed(rng.uniform(-0.2, 0.2, 3), [650, -250, 0], [850, 250, 200], rng)
         else:
-            hand_eye = rotation(0, -np.pi / 2, 0) @ tilt
-            hand_eye[:3, 3] = rng.uniform([1250, -200, 600], [1400, 200, 900])
-            shift[:3, 3] = rng.uniform([-30, -30, 120], [30, 30, 180])
-            part_pose = shift @ rotation(*rng.uniform(-0.3, 0.3, 3))
+            facing = placed([0, -np.pi / 2, 0], [1250, -200, 600], [1400, 200, 900], rng)
+            hand_eye = facing @ motion(np.r_[tilt, 0, 0, 0])
+            gripper = placed([0, 0, 0], [-30, -30, 120], [30, 30, 180], rng)
+            part_pose = gripper @ motion(np.r_[rng.uniform(-0.3, 0.3, 3), 0, 0, 0])
         views = int(rng.integers(12, 17) if kind == "clouds" else rng.choice([10, 14, 18, 25, 40, 60]))
         seen = looks(rng, 6 * views)
         seen[0, :3, :3] = np.diag([1, -1, -1])
-        inverse = np.linalg.inv(seen)
-        flange = part_pose @ inverse @ np.linalg.inv(hand_eye)
-        if not eye_in_hand:
+        if eye_in_hand:
+            flange = part_pose @ np.linalg.inv(hand_eye @ seen)
+        else:
             flange = hand_eye @ seen @ np.linalg.inv(part_pose)
         homes, can = reach(arm, np.repeat(flange[:1], 60, 0), rng.uniform(-2, 2, (60, 6)))
         if not can.any():
@@ -280,7 +257,7 @@ def scan(cell: Cell, pose: Array, noise: float, rng: np.random.Generator) -> tup
     return exact + error[:, None] * rays, seen_normals / np.linalg.norm(seen_normals, axis=1, keepdims=True)
 
 
-def hide(cell: Cell, law: Law, times: float, rng: np.random.Generator) -> SimpleNamespace:
+def hide(cell: Cell, law: Any, times: float, rng: np.random.Generator) -> SimpleNamespace:
     """Put geometry, law and scatter into the cell; return what is true of it.
 
     The true hand-eye without a model is the one at the mean of all errors but the scatter: what the best linear
@@ -293,46 +270,38 @@ def hide(cell: Cell, law: Law, times: float, rng: np.random.Generator) -> Simple
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     body = directions / (1 + surface(directions))[:, None]
     perfect = _as_seen(cell, body)
-    _give_geometry(cell, body, rng)
+    twists = rng.standard_normal((6, 1, 6)) * [1e-5, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
+    points = chain(cell.arm)[1:, None, :3, 3]
+    points[-1] = points[-2]
+    twists[..., 3:] -= np.cross(twists[..., :3], points)
+    cell.links += twists
+    cell.links += twists * (GEOMETRY / _rms(_as_seen(cell, body) - perfect) - 1)
     without, still = _as_seen(cell, body), cell.scanner_seen()
-    where = law.act(cell, law.size * times, rng)
+    where = law.act(cell, law.size * times, rng) or 0
     seen = _as_seen(cell, body)
     by_joint = []
-    for joint in range(6):
+    for joint, share in enumerate(SHARES):
         cell.joints[:, joint] += 1e-4
-        by_joint.append((_as_seen(cell, body) - seen) / 1e-4 * (1 if joint < 3 else 2))
+        by_joint.append((_as_seen(cell, body) - seen) / 1e-4 * share)
         cell.joints[:, joint] -= 1e-4
     scatter = SCATTER * rng.uniform(0.7, 1.3)
     size = scatter / np.sqrt(sum(_rms(shift) ** 2 for shift in by_joint))
-    views = len(cell.q)
-    columns = size * np.stack([shift.reshape(views, -1) for shift in by_joint], -1)
-    whiten = np.linalg.inv(np.linalg.cholesky(columns @ columns.swapaxes(1, 2) + SCATTER**2 * np.eye(3 * len(body))))
-    pose, steps = cell.scanner_part(), motion(-1e-4 * np.eye(6))
-    moved = [_as_seen(cell, body, step @ pose) for step in steps] + [
-        _as_seen(cell, body, pose @ step) for step in steps
-    ]
+    pose, steps, views = cell.scanner_part(), motion(-1e-4 * np.eye(6)), len(cell.q)
+    moved = [_as_seen(cell, body, step @ pose) for step in steps]
+    moved += [_as_seen(cell, body, pose @ step) for step in steps]
     jacobian = np.stack([(places - seen).reshape(views, -1) / 1e-4 for places in moved], -1)
     shifts = np.stack([(seen - start).reshape(views, -1) for start in (perfect, without)], -1)
+    columns = size * np.stack([shift.reshape(views, -1) for shift in by_joint], -1)
+    whiten = np.linalg.inv(np.linalg.cholesky(columns @ columns.swapaxes(1, 2) + SCATTER**2 * np.eye(3 * len(body))))
     best = np.linalg.lstsq((whiten @ jacobian).reshape(-1, 12), (whiten @ shifts).reshape(-1, 2), rcond=None)[0]
     visible = _rms((shifts - jacobian @ best)[..., 1].reshape(views, -1, 3))
     moving = np.linalg.inv(cell.hand_eye) @ (cell.scanner_seen() - still)
     turning = (moving - moving.swapaxes(1, 2))[:, (2, 0, 1), (1, 2, 0)] / 2
-    shifting = np.c_[turning, moving[:, :3, 3]]
-    cell.joints += rng.standard_normal(cell.q.shape) * size * [1, 1, 1, 2, 2, 2]
-    geometry = best[:6, 0] - best[:6, 1]
-    twists = {"plain": best[:6, 0], "mean": geometry + shifting.mean(0), "last": geometry + shifting[-1]}
-    poses = {name: cell.hand_eye @ motion(twist) for name, twist in twists.items()} | {"nominal": cell.hand_eye}
+    modelled = np.c_[turning, moving[:, :3, 3]] + best[:6, 0] - best[:6, 1]
+    cell.joints += rng.standard_normal(cell.q.shape) * size * SHARES
+    known = {"plain": best[:6, 0], "mean": modelled.mean(0), "last": modelled[-1], "nominal": np.zeros(6)}
+    poses = {name: cell.hand_eye @ motion(twist) for name, twist in known.items()}
     return SimpleNamespace(where=where, poses=poses, visible=visible, scatter=scatter)
-
-
-def _give_geometry(cell: Cell, body: Array, rng: np.random.Generator) -> None:
-    """Give the arm a little geometry of its own: lengths, twists and zeros of its joints."""
-    perfect = _as_seen(cell, body)
-    _, points, _, _ = chain(cell.arm)
-    twists = rng.standard_normal((6, 6)) * [1e-5, 1e-5, 1e-5, 1e-2, 1e-2, 1e-2]
-    twists[:, 3:] -= np.cross(twists[:, :3], np.vstack([points[1:], points[-1:]]))
-    cell.links += twists[:, None]
-    cell.links += twists[:, None] * (GEOMETRY / _rms(_as_seen(cell, body) - perfect) - 1)
 
 
 def _rms(shifts: Array) -> float:
@@ -354,59 +323,48 @@ def write(cell: Cell, kind: str, folder: Path, rng: np.random.Generator) -> None
     poses = cell.scanner_part()
     names = [f"v{view:03d}" for view in range(len(poses))]
     folder.mkdir(parents=True)
-    lines = [
-        'format = "stitch-session/1"',
-        f'name = "{folder.name}"',
-        'length_unit = "mm"',
-        f'mount = "{"eye_in_hand" if cell.eye_in_hand else "eye_to_hand"}"',
-        "[scanner]",
-    ]
+    mount = "eye_in_hand" if cell.eye_in_hand else "eye_to_hand"
+    text = f'format = "stitch-session/1"\nname = "{folder.name}"\nlength_unit = "mm"\nmount = "{mount}"\n[scanner]\n'
     if rng.random() < 0.7:
         rough = cell.hand_eye @ motion(np.r_[rng.normal(0, 0.005, 3), rng.normal(0, 2, 3)])
-        lines.append(f"pose = {rough.tolist()}")
+        text += f"pose = {rough.tolist()}\n"
     if kind == "clouds" and rng.random() < 0.5:
-        lines += [f"noise = {noise:.3f}", "standoff = 400.0"]
-    lines += ["[robot]", f'name = "{cell.arm}"', 'dh = "standard"', "joints = ["]
-    for a, alpha, d, mass, com in ARMS[cell.arm]:
-        lines.append(f"{{ a = {a}, alpha_deg = {alpha}, d = {d}, theta_deg = 0, mass = {mass}, com = {list(com)} }},")
-    lines.append("]")
-    if rng.random() < 0.5:
-        lines.append("repeatability = { position = 0.05 }")
-    (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    columns = {"view": names, "time_s": cell.time, **cell.columns}
+        text += f"noise = {noise:.3f}\nstandoff = 400.0\n"
+    text += f'[robot]\nname = "{cell.arm}"\ndh = "standard"\njoints = [\n'
+    for a, alpha, d, mass, *com in ARMS[cell.arm].tolist():
+        text += f"{{ a = {a}, alpha_deg = {alpha}, d = {d}, theta_deg = 0, mass = {mass}, com = {com} }},\n"
+    text += "]\n" + ("repeatability = { position = 0.05 }\n" if rng.random() < 0.5 else "")
+    (folder / "session.toml").write_text(text, encoding="utf-8")
+    columns: dict[str, Any] = {"view": names, "time_s": cell.time, **cell.columns}
     columns |= {f"j{k + 1}_deg": np.degrees(cell.q[:, k]) for k in range(6)}
     if cell.velocities.any():
         columns |= {f"j{k + 1}_velocity_deg_s": np.degrees(cell.velocities[:, k]) for k in range(6)}
     if kind == "clouds":
         columns["cloud"] = [f"clouds/{name}.ply" for name in names]
         (folder / "clouds").mkdir()
-        for name, pose in zip(names, poses, strict=True):
-            _write_ply(folder / "clouds" / f"{name}.ply", np.hstack(scan(cell, pose, noise, rng)))
+        for file, pose in zip(columns["cloud"], poses, strict=True):
+            points = np.hstack(scan(cell, pose, noise, rng))
+            head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+            head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+            (folder / file).write_bytes((head + "end_header\n").encode() + points.astype("<f4").tobytes())
     else:
-        _write_balls(cell, poses, names, noise, folder, rng)
+        rows = ((names[view], f"ball{ball}", *place, noise) for view, ball, place in balls(cell, poses, noise, rng))
+        _write_csv(folder / "points.csv", ["view", "target", "x", "y", "z", "sigma"], rows)
     _write_csv(folder / "views.csv", list(columns), zip(*columns.values(), strict=True))
 
 
-def _write_balls(
-    cell: Cell, poses: Array, names: list[str], noise: float, folder: Path, rng: np.random.Generator
-) -> None:
+def balls(cell: Cell, poses: Array, noise: float, rng: np.random.Generator) -> list[tuple[int, int, Array]]:
+    """Return view, ball and place in the scanner frame of the balls in its field."""
     count = int(rng.integers(5, 11))
-    balls = np.c_[rng.uniform(-90, 90, (count, 2)), rng.uniform(-40, 40, count)]
-    exact = balls @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
-    rays = exact / np.linalg.norm(exact, axis=-1, keepdims=True)
+    centres = np.c_[rng.uniform(-90, 90, (count, 2)), rng.uniform(-40, 40, count)]
+    exact = centres @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+    distance = np.linalg.norm(exact, axis=-1)
     error = sum((law(exact, np.ones(exact.shape[:2])) for law in cell.ranges), np.zeros(exact.shape[:2]))
-    seen = exact + error[..., None] * rays + rng.normal(0, noise, exact.shape)
+    seen = exact * (1 + error / distance)[..., None] + rng.normal(0, noise, exact.shape)
     inside = np.hypot(exact[..., 0], exact[..., 1]) < FIELD * exact[..., 2]
-    rows = [(names[v], f"ball{b}", *seen[v, b], noise) for v, b in np.argwhere(inside)]
-    _write_csv(folder / "points.csv", ["view", "target", "x", "y", "z", "sigma"], rows)
+    return [(view, ball, seen[view, ball]) for view, ball in np.argwhere(inside)]
 
 
 def _write_csv(file: Path, head: list[str], rows: Any) -> None:
     lines = [",".join(cell if isinstance(cell, str) else f"{cell:.7f}" for cell in row) for row in rows]
     file.write_text("\n".join([",".join(head), *lines]) + "\n", encoding="utf-8")
-
-
-def _write_ply(file: Path, numbers: Array) -> None:
-    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(numbers)}"]
-    head += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
-    file.write_bytes("\n".join([*head, "end_header", ""]).encode() + numbers.astype("<f4").tobytes())
