@@ -15,10 +15,10 @@ import numpy as np
 
 Array = np.ndarray
 # Rows: a, alpha (degrees), d, mass (kg), and the centre of mass in the link's own frame.
-_OFFSET = """0 90 181 7.4 0 -20 3; -613 0 0 13 290 0 160; -572 0 0 4.1 250 0 50; 0 90 174 2.1 0 -18 6; 0 -90 120 2 0 18 6;
- 0 0 117 0.6 0 0 -25"""
-_SPHERICAL = """260 -90 675 60 -120 90 0; 680 0 0 40 -330 0 60; 35 -90 0 35 0 0 40; 0 90 670 12 0 -150 0; 0 -90 0 5 0 0 10;
- 0 0 158 1.5 0 0 -30"""
+_OFFSET = """0 90 181 7.4 0 -20 3; -613 0 0 13 290 0 160; -572 0 0 4.1 250 0 50; 0 90 174 2.1 0 -18 6;
+ 0 -90 120 2 0 18 6; 0 0 117 0.6 0 0 -25"""
+_SPHERICAL = """260 -90 675 60 -120 90 0; 680 0 0 40 -330 0 60; 35 -90 0 35 0 0 40; 0 90 670 12 0 -150 0;
+ 0 -90 0 5 0 0 10; 0 0 158 1.5 0 0 -30"""
 ARMS = {
     name: np.array([row.split() for row in table.split(";")], float)
     for name, table in (("offset wrist", _OFFSET), ("spherical wrist", _SPHERICAL))
@@ -262,8 +262,8 @@ def hide(cell: Cell, law: Any, times: float, rng: np.random.Generator) -> Simple
 
     The true hand-eye without a model is the one at the mean of all errors but the scatter: what the best linear
     estimate over these views, which knows the scatter's covariance, makes of them in hand-eye and place of the part.
-    `visible` is what that leaves of the law, rms of a place in mm. Beside a model of the law it is moved by what the law
-    does between the reported flange and the scanner, in the mean or in the last view; part and optics do not move it.
+    `visible` is what that leaves of the law, rms of a place in mm. Beside a model of the law it is moved by what the
+    law does between the reported flange and the scanner, in the mean or last view; part and optics do not move it.
     """
     directions = rng.standard_normal((12, 3))
     directions[:, 2] = np.abs(directions[:, 2])
