@@ -4,7 +4,7 @@ A wrong pose moves all points of a view by one rigid motion. Stock on a casting,
 points off along their own normals, all of them or those of one part of the surface, and leaves the pose alone. A view
 is held against the others, matched without it and held by what robot and overlaps say of them, so that nothing of its
 stock is in what it is measured by: views that are freed from the robot bend along what their overlaps hardly hold, and
-take up a third of it. With e the distances of its points from the surface of the others, all poses free under the
+take up much of it. With e the distances of its points from the surface of the others, all poses free under the
 scatter that the others show, the hand-eye free too:
 
     displaced   e = B δ + noise, the view at any pose;
