@@ -46,6 +46,7 @@ def diagnose_run(
     if sessions := runs_of_rig(run):
         _diagnose_together([run / name for name in sessions], effects_file, trust, as_json)
         end_at_once()
+        return
     diagnosis, document = diagnose_folder(run, effects_file, trust)
     if as_json:
         emit(to_json(document))
