@@ -182,8 +182,9 @@ function duelPlot(rivals, view, names, um) {
   const lines = [first, second].flatMap((plot, k) => plot.spec.series.slice(0, 2).map(s => ({ ...s, tint: tints[k], dashed: k === 1 })));
   const expected = view.expected.slice(0, 2).map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [e.sigma * factor], tint: tints[k], open: true,
     said: [`${e.effect} expects ${shortNumber(e.value * factor)} ± ${shortNumber(2 * e.sigma * factor)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${shortNumber(Number((e.value * factor).toPrecision(2)))} ± ${shortNumber(Number((2 * e.sigma * factor).toPrecision(2)))}`, below: e.value < view.expected[1 - k].value }));
+  const [a, b] = view.expected, apart = Math.abs(a.value - b.value) > 2 * Math.hypot(a.sigma, b.sigma);
   return {
-    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that decides`,
+    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that decides${apart ? "" : ", where they part in other directions than this one"}`,
     spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ""}` }, series: [...lines, ...expected, dots] },
   };
 }

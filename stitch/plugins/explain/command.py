@@ -37,7 +37,7 @@ def explain_run(
     """
     from stitch.diagnosis.diagnose import linear_model_of
     from stitch.output.json_file import to_json
-    from stitch.output.stored_run import load_run
+    from stitch.output.stored_run import load_run, standing_diagnosis
     from stitch.plugins.explain.explain import EFFECT_NAME, explain
     from stitch.system.files import whole_file
 
@@ -50,6 +50,10 @@ def explain_run(
         raise InputError(
             f"{run}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its file, and add that"
         )
+    standing = standing_diagnosis(run, state)
+    if not as_json and standing.get("verdict") in ("missing_effect", "cannot_tell"):
+        named = " or ".join(standing["effects"])
+        say(f"{named} of the library is still open, and a formula would take its part: add or decide that first.")
     with show_activity("explaining: what every view tells of its pose"):
         linear = linear_model_of(state)
     with show_activity("explaining: trying formulas"):
