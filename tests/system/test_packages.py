@@ -47,8 +47,7 @@ def name_of(requirement):
 def installed_by(text):
     """What commands of a text install, as they name it, and what they do it with."""
     for words in re.findall(r"\bpip install\s+((?:--?[\w-]+\s+)*)'?([\w.{}()-]+(?:\[[^\]]*\])?)", text):
-        if not words[1].endswith(".txt"):  # a list of requirements
-            yield words[1]
+        yield words[1]
 
 
 def test_the_name_is_that_of_the_project():
