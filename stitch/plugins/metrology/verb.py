@@ -67,7 +67,7 @@ def measure(
     Example:
         >>> at = run.stitched.points[len(run.stitched) // 2]
         >>> axis = run.stitched.normals[len(run.stitched) // 2]
-        >>> measured = stitch.measure(run, [stitch.Feature("middle", "point", at=at, axis=axis, radius=8.0)])
+        >>> measured = stitch.measure(run, [stitch.Feature("middle", "point", at=at, axis=axis, radius=15.0)])
         >>> measured.numbers[0].name, measured.numbers[0].U > 0
         ('middle.deviation', True)
     """
