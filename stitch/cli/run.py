@@ -131,6 +131,8 @@ def run(
     run_folder.preload_entry_points("stitch.reports")
     with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
         folders = [scratch / folder for folder in inner]
+        for folder in folders:
+            folder.mkdir(exist_ok=True)  # recordings are written while the run goes on
         recorders = [recorder_for(folder, recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=register or DEFAULT, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
@@ -300,7 +302,6 @@ def _write_runs(
 
     fits = []
     for result, folder in zip(runs, folders, strict=True):
-        folder.mkdir(exist_ok=True)
         write_with_page(result, folder, tolerance)
         if mesh:
             from stitch.output.mesh import write_mesh

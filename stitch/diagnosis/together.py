@@ -137,7 +137,10 @@ def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int)
     """Return one effect with common numbers: each session at the scatter that is left beside the effect there."""
     parts = []
     for linear, scored in zip(linears, scores, strict=True):
-        variances = linear.null.variances if scored.variances is None else scored.variances
+        variances = linear.null.variances
+        # Variances of a model with other components of scatter are not this one's.
+        if scored.variances is not None and len(scored.variances) == len(variances):
+            variances = scored.variances
         at = replace(linear, null=at_variances(linear.mixed, variances))
         whole = scored.candidate.forms[0]
         ((information, vector),) = at.information([whole.selected])

@@ -130,9 +130,9 @@ MISTAKES: dict[str, dict[str, str]] = {
         "wrong joint": "{joint} of {view} reads {stated:.4f}, {fits:.4f} would fit (it is {off}); to fix: correct it",
         "torn": "a part of this scan contradicts the other scans wherever it is put: something moved during the scan, "
         "or two scans are in one file; to fix: scan again",
-        "stock": "{view} shows its surface {size} ± {U} {side} that of the others, {where}, as stock or a moved zero of "
-        "the scanner would; no single motion of the view explains it, other errors of the cell may. It was taken off; "
-        "to fix: nothing if the part had stock, else scan again.",
+        "stock": "{view} shows its surface {size} ± {U} {side} that of the others, {where}, as stock or a moved zero "
+        "of the scanner would; no single motion of the view explains it, other errors of the cell may. It was taken "
+        "off; to fix: nothing if the part had stock, else scan again.",
         "suspected": "the view {off}, which an effect of the arm may cause too; to fix: run and diagnose, and look at "
         "this scan",
         "unexplained": "the poses contradict the scans by {by}, more than any arm, and no usual mistake explains it; "

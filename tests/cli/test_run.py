@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import typer
 
+from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.fixtures.labelled_arm import (
     labelled_cell,
@@ -231,3 +232,12 @@ def test_a_reader_that_has_seen_enough_loses_no_run(session, tmp_path):
     said = run.stderr.read()
     assert run.wait() == 0, said
     assert (tmp_path / "run" / "model.toml").is_file()
+
+
+def test_two_sessions_of_scans_are_run_with_their_recordings_and_diagnosed_together(tmp_path, stitch_command):
+    names = ("monday", "tuesday")
+    for seed, name in enumerate(names):
+        write_session(tmp_path / name, measured_blade(seed, views=5, pixels=50), name)
+    stitch_command("run", *(tmp_path / name for name in names), "-o", tmp_path / "rig")
+    assert {path.parent.name for path in (tmp_path / "rig").glob("*/recording.rrd")} == set(names)
+    assert "together: they show no effect of their arm" in stitch_command("diagnose", tmp_path / "rig")
