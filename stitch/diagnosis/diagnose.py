@@ -102,6 +102,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         scanner_error=evidence.scanner_error or (find_scanner_error(linear) if is_unknown else None),
         doubts=state.doubts,
         laws=evidence.told_laws,
+        rival_trend=evidence.rival_trend if evidence.named else "",
         beyond_belief=too_large(evidence.named),
         together=_named_together(evidence),
         tried=state.tried,

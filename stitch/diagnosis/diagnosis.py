@@ -105,6 +105,7 @@ class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_docu
     doubts: tuple[str, ...] = ()
     coincidence: str = ""  # of `Evidence`
     laws: tuple[Ranked, ...] = ()  # of the dictionary: rivals of what is named, or what is found where nothing is
+    rival_trend: str = ""  # of `Evidence`
     beyond_belief: tuple[str, ...] = ()  # parameters of what is named that are larger than is believed of them
     together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why

@@ -239,13 +239,20 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
 
 
 def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply | None:
-    """Is it wanted beside the others and beside any trend without a name, of a joint or in time?"""
+    """Is it wanted beside the others and beside any trend without a name, of a joint or in time?
+
+    A trend that is as likely is a rival: these views cannot tell it from the effect. One that is likelier explains them
+    instead.
+    """
     if regime_of(case.linear).prior:
         return None  # the prior of pose errors has asked already
     best, *others = evidence.together
-    if least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score) > limits.ODDS:
+    factor, trend = least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score)
+    if factor > limits.ODDS:
         return Reply("yes")
-    note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views as well"
+    if factor > -limits.ODDS:
+        return Reply(f"or {trend}", {"rival_trend": trend})
+    note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views better"
     return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
@@ -302,7 +309,7 @@ def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
     alone = {r.name: r for r in evidence.ranked}
     asked = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
     left_out = {name: cross_validate(case.linear, scored) for name, scored in asked.items()}
-    if evidence.verdict != "missing_effect":
+    if len(evidence.named) != 1:
         return Reply("not asked of a group", {"left_out": left_out}) if effects else None
     objections = list[str]()
     for effect in effects:

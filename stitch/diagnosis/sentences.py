@@ -103,7 +103,7 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
     is_missing = "is missing" if d.certain else "may be missing"
-    yield f"Something {is_missing}: {' or '.join([*d.effects, *_laws_in_words(d)])}. These views cannot tell which."
+    yield f"Something {is_missing}: {' or '.join([*d.effects, *unnamed_in_words(d)])}. These views cannot tell which."
     if d.coincidence:
         yield f"{d.coincidence}. To tell, drive a few of these poses again from the first side."
     yield _odds_over_chance(d)
@@ -166,16 +166,16 @@ def _allowed(d: Diagnosis, length_unit: str) -> str:
     return f"No repeatability is stated under [robot]; ordinary arms stay below {limits}."
 
 
-def _laws_in_words(d: Diagnosis) -> list[str]:
-    return [law_of(r).words for r in d.laws]
+def unnamed_in_words(d: Diagnosis) -> list[str]:
+    """Return what has no name of its own and explains the views as well as what is named, or what is found instead."""
+    return [*(law_of(r).words for r in d.laws), *([d.rival_trend] if d.rival_trend else [])]
 
 
 def _laws_found(d: Diagnosis) -> Iterator[str]:
     """Say which laws of the dictionary do, with their sizes, and what to do."""
     if not d.laws:
         return
-    sizes = [format_amount(*law_size(d.linear, r)) for r in d.laws]
-    told = [f"{words} by {size}" for words, size in zip(_laws_in_words(d), sizes, strict=True)]
+    told = [f"{law_of(r).words} by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
     among = "A law does" if len(told) == 1 else "One of these laws does, and these views cannot tell which"
     yield f"{among}: {_listed(told, 'or')} (p = {d.laws[0].adjusted:.1g})."
     yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."
@@ -188,11 +188,9 @@ def _residual_sentence(d: Diagnosis, length_unit: str) -> str:
 
 def _odds_over_chance(d: Diagnosis) -> str:
     """Say how much likelier than chance it is, where that is little."""
-    return (
-        ""
-        if d.log_odds_over_nothing > ODDS
-        else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
-    )
+    if d.log_odds_over_nothing > ODDS:
+        return ""
+    return f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
 
 
 def _scatter(translation: float, rotation: float, length_unit: str) -> str:

@@ -67,6 +67,12 @@ class FittedProcess:
         return self.process.joint
 
     @property
+    def words(self) -> str:
+        """Joint 3 follows a smooth curve without a name; the flange wanders in time."""
+        joint = self.joint and f"joint {self.joint} follows a smooth curve without a name"
+        return joint or "the flange wanders in time"
+
+    @property
     def flange_scatter(self) -> Array:
         """(2,) variances along an axis by which the flange turns and moves anew in every view, beside the process."""
         return self.base.flange_scatter(self.fit)

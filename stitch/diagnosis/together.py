@@ -85,8 +85,7 @@ def decide_together(linears: Sequence[LinearModel]) -> Together:
     best = shared[0]
     odds = best.log_posterior - otherwise.get(rival, -np.inf)
     near = tuple(s.name for s in shared if s.log_posterior > best.log_posterior - limits.ODDS)
-    by_session = zip(linears, scores[best.name], strict=True)
-    beside = sum(least_log_bayes_factor(linear, scored) for linear, scored in by_session)
+    beside = sum(least_log_bayes_factor(*of)[0] for of in zip(linears, scores[best.name], strict=True))
     if odds < limits.ODDS or beside < limits.ODDS:
         return Together("unknown_effect", (), tuple(shared), rival, odds)
     return Together("missing_effect" if len(near) == 1 else "cannot_tell", near, tuple(shared), rival, odds)

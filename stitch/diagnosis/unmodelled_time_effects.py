@@ -287,9 +287,9 @@ def unmodelled_trends(linear: LinearModel) -> tuple[FittedProcess, ...]:
     return tuple(sorted(fitted, key=lambda process: -process.log_bayes_factor))
 
 
-def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
-    """Return the log Bayes factor of an effect beside that trend which leaves least of it; ∞ where pose errors have a
-    prior."""
+def least_log_bayes_factor(linear: LinearModel, scored: Score) -> tuple[float, str]:
+    """Return the log Bayes factor of an effect beside that trend which leaves least of it, and the trend in words; ∞
+    where pose errors have a prior."""
 
     def factor_beside(trend: FittedProcess) -> float:
         both = linear.in_blocks(np.hstack([trend.columns, scored.form.columns]))
@@ -298,7 +298,9 @@ def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
         start = trend.fit.variances
         return 0.5 * (trend.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
 
-    return min(parallel(factor_beside, unmodelled_trends(linear)), default=np.inf)
+    trends = unmodelled_trends(linear)
+    beside = zip(parallel(factor_beside, trends), (trend.words for trend in trends), strict=True)
+    return min(beside, default=(np.inf, ""))
 
 
 @dataclass(frozen=True)
@@ -399,8 +401,7 @@ def _trend_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
 
 def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     """Return the deviance of the null without some components."""
-    assert linear.pose_errors is not None
-    assert linear.mixed.further is not None
+    assert linear.pose_errors is not None and linear.mixed.further is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     components = np.append(np.ones(NOISE + 1, bool), keep)
     further = linear.mixed.further.select(keep)

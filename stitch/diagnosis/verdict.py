@@ -36,6 +36,7 @@ class Evidence:
     empirical: tuple[Ranked, ...]  # shapes without a cause, best first
     laws: tuple[Ranked, ...] = ()  # of the dictionary that no effect says, likeliest first
     rival_laws: tuple[Ranked, ...] = ()  # those of them that explain the views as well as what is named
+    rival_trend: str = ""  # the smooth error without a name that explains them as well, in words
     # An effect or a shape is 12 to 1 over nothing at a family-wise p < 0.04, and views left out do not refute it.
     alarm: bool = False
     # Effects of which each would explain the alarm, likeliest first; alone where none comes within 20 to 1.
@@ -73,7 +74,8 @@ class Evidence:
         """The first row of the table in docs/diagnosis.md ("The verdict") whose condition holds."""
         without_rival = not (self.unmodelled_explains_it or self.refuted or scanner_explains_it(self))
         if self.explanation and without_rival:
-            return "missing_effect" if len(self.explanation) == 1 and not self.rival_laws else "cannot_tell"
+            has_rival = len(self.explanation) > 1 or self.rival_laws or self.rival_trend
+            return "cannot_tell" if has_rival else "missing_effect"
         scanner_errs = self.scanner_error is not None and self.scanner_error.over_noise
         unexplained = self.alarm or self.repeating_errors or self.implausible_scatter or self.beyond_expected
         return "unknown_effect" if unexplained or scanner_errs or self.overlap_misfit > 0 else "adequate"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
-from stitch.diagnosis.sentences import odds_text
+from stitch.diagnosis.sentences import odds_text, unnamed_in_words
 from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE, ODDS
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
@@ -48,8 +48,7 @@ def _same_as_finding(diagnosis: Diagnosis) -> str | None:
 
 def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
     """Return what is missing, and how far the error should fall with it."""
-    rivals = [law_of(r).words for r in diagnosis.laws]
-    named = " or ".join([*map(effect_in_words, diagnosis.effects), *rivals])
+    named = " or ".join([*map(effect_in_words, diagnosis.effects), *unnamed_in_words(diagnosis)])
     sure = diagnosis.certain or diagnosis.log_odds_over_nothing > ODDS
     odds = "" if sure else f" The odds against chance are {odds_text(diagnosis.log_odds_over_nothing)}."
     match diagnosis.verdict:
@@ -159,7 +158,7 @@ def suggested_command(diagnosis: Diagnosis, run: str) -> str:
             return f"Next, to see where the model fails: stitch review {run}"
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
-        case "cannot_tell" if diagnosis.laws or not _group_helps(diagnosis):
+        case "cannot_tell" if unnamed_in_words(diagnosis) or not _group_helps(diagnosis):
             return f"Next, for views that would separate them: stitch next {run}"
         case "cannot_tell":
             return f"Next, to fit them as one group: stitch add {run} --group"

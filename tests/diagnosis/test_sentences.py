@@ -57,6 +57,7 @@ def test_more_than_an_expected_scatter_is_said_with_what_is_expected():
         follows_field=False,
         scanner_error=None,
         laws=(),
+        rival_trend="",
     )
     told = diagnosis_sentence(found, "mm", None)
     assert "ordinary arms stay below 40 µm and 0.045 mrad. So more is left than scatter explains." in told
@@ -80,6 +81,7 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
         log_odds_over_nothing=np.log(odds),
         coincidence="",
         laws=(),
+        rival_trend="",
         beyond_belief=too_large([SimpleNamespace(score=score)]) if score.fitted else (),
     )
     found.certain = Diagnosis.certain.fget(found)

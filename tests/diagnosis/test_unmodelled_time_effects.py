@@ -235,6 +235,17 @@ def test_errors_that_no_library_has_get_no_name(which):
         assert [u.words for u in found.repeating_errors] == [f"follow the joints, joint {joint} above all"]
 
 
+@pytest.mark.usefixtures("few_effects")
+def test_an_eccentric_gear_and_a_curve_of_its_joint_without_a_name_are_rivals():
+    """Within 70° of its middle a wave once a turn is any smooth curve, where it is as small as this."""
+    gear = 1.2e-4 * np.eye(6)[2]
+    session, *_ = labelled_cell(SEED, views=MANY, gears=lambda q: gear * np.sin(q), targets=TARGETS[:2])
+    found = diagnose(run(session))
+    assert (found.verdict, found.effects) == ("cannot_tell", ("gear_eccentricity",)), found.sentence
+    assert "gear_eccentricity or joint 3 follows a smooth curve without a name" in found.sentence
+    assert found.candidates[0].cross_validation.helps
+
+
 @pytest.mark.slow
 def test_joints_that_scatter_do_not_repeat():
     """Every joint anew at every pose, 40 µrad beside a steady flange: scatter, and as large as it was drawn."""
@@ -266,10 +277,10 @@ def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle()
     found = diagnose(run(session))
     assert found.effects == ("joint_offset",), found.sentence
     scored = found.candidates[0].ranked.score
-    assert found.candidates[0].name == "joint_offset" and least_log_bayes_factor(found.linear, scored) > 20
+    assert found.candidates[0].name == "joint_offset" and least_log_bayes_factor(found.linear, scored)[0] > 20
     beside = found.linear.conditioned_on(scored.form.columns, scored.sizes)
     idle = next(c.ranked.score for c in found.candidates if c.name == "gear_harmonic")
-    assert least_log_bayes_factor(beside, idle) < 3
+    assert least_log_bayes_factor(beside, idle)[0] < 3
     # The law that is there is seen: a process explains it, with less scatter than the views seemed to have.
     likeliest = unmodelled_trends(beside)[0]
     assert 0.5 * (beside.null.deviance - likeliest.fit.deviance) > 20

@@ -40,6 +40,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve,
     found = SimpleNamespace(
         verdict=verdict,
         laws=(),
+        rival_trend="",
         curves=curves,
         time_curve=time_curve,
         doubts=(),
@@ -64,6 +65,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     found = SimpleNamespace(
         verdict="cannot_tell",
         laws=(),
+        rival_trend="",
         effects=("play",),
         candidates=(cause,),
         doubts=(),
@@ -87,6 +89,7 @@ def test_no_model_is_built_on_a_doubtful_session(verdict):
     found = SimpleNamespace(
         verdict=verdict,
         laws=(),
+        rival_trend="",
         effects=("backlash",),
         curves=("of joint 3",),
         time_curve=None,
@@ -108,6 +111,7 @@ def test_a_step_that_is_named_is_no_doubt_beside_it(moved, distinguishable, furt
     found = SimpleNamespace(
         verdict="missing_effect",
         laws=(),
+        rival_trend="",
         effects=(named,),
         candidates=(SimpleNamespace(name=named, cross_validation=None),),
         doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
@@ -131,6 +135,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
         found = SimpleNamespace(
             verdict="adequate",
             laws=(),
+            rival_trend="",
             effects=(),
             scanner_error=smooth,
             doubts=(),
@@ -155,6 +160,7 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
     found = SimpleNamespace(
         verdict="missing_effect",
         laws=(),
+        rival_trend="",
         effects=("settling",),
         candidates=(candidate,),
         doubts=(),
@@ -183,6 +189,7 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
     found = SimpleNamespace(
         verdict="missing_effect",
         laws=(),
+        rival_trend="",
         effects=("settling",),
         candidates=(SimpleNamespace(name="settling", cross_validation=left),),
         doubts=(),
@@ -213,6 +220,7 @@ def _found(
     return SimpleNamespace(
         verdict=verdict,
         laws=(),
+        rival_trend="",
         effects=("play",) if verdict == "missing_effect" else (),
         candidates=(candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None)),
         certain=certain,
