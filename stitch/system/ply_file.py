@@ -149,10 +149,10 @@ def _read_header(stream: BinaryIO) -> tuple[str, list[_Element]]:
                 elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length_kind]))
             case ["property", kind, name] if elements and kind in _TYPES:
                 elements[-1].properties.append(_Property(name, _TYPES[kind]))
-            case [] | ["comment" | "obj_info", *_] if line:
-                pass
-            case _:
-                raise PlyError(f"a header line cannot be read: {' '.join(words)[:80]!r}" if line else "no end_header")
+            case ["format" | "element" | "property", *_]:
+                raise PlyError(f"a header line cannot be read: {' '.join(words)[:80]!r}")
+            case _ if not line:
+                raise PlyError("no end_header")
     if not encoding:
         raise PlyError("no line says the format")
     return encoding, elements

@@ -131,6 +131,8 @@ _CLOSED, _MOST_CLOSED = 0.5, 0.85
 # Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
 # (see CLEARLY_BETTER) tells it.
 _TWICE, BY_CHANCE = 1.9, 1.12
+# Two rough fits of the same differ by so many milliradians, and millimetres.
+_ROUGH = 5.0
 # A fitted scale belongs to a unit within this factor: 10 and 25.4 lie 2.5 apart.
 _UNIT_FACTOR = 1.5
 
@@ -263,7 +265,8 @@ def _choose_interpretation(
         judged.append(ConventionScore(interpretations[i], fit.T_mount, fit.misfit, fit.meets, share))
     if not by_targets:
         judged.sort(key=lambda j: j.misfit)
-    best, runner_up = judged[0], judged[1] if len(judged) > 1 else None
+    best = judged[0]
+    runner_up = next((other for other in judged[1:] if by_targets or not _stitch_alike(best, other)), None)
     clear = runner_up is None or runner_up.misfit >= CLEARLY_BETTER * best.misfit
     # The motions alone single a way out.
     close = equivalent_hypotheses(list(closing.values()))
@@ -278,6 +281,18 @@ def _choose_interpretation(
         best, interpretation=same[0], T_mount=transferred_hand_eye(best.interpretation, same[0], best.T_mount)
     )
     return ConventionChoice(best, runner_up, bool(told), same[1:], *_flange_distances(capture, best))
+
+
+def _stitch_alike(best: ConventionScore, other: ConventionScore) -> bool:
+    """Whether the hand-eyes of two ways place the views alike, as those of turns about one axis do, either way round.
+
+    Asked only where half of the motions close: a way that does not fit is not certain for want of another.
+    """
+    a, b = best.interpretation.hypothesis(0), other.interpretation.hypothesis(0)
+    if (best.closed or 0.0) < _CLOSED or a.used != b.used:
+        return False
+    A, B = _used_poses(a) @ best.T_mount, _used_poses(b) @ other.T_mount
+    return _small(np.abs(frames.inverse(A[:1]) @ A - frames.inverse(B[:1]) @ B) / _ROUGH)
 
 
 def _with_confirmed_unit(motions: RelativeScans, interpretations: Sequence[Interpretation]) -> list[Interpretation]:

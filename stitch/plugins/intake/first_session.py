@@ -26,7 +26,7 @@ from stitch.plugins.intake.convention_choice import (
     require_own_frames,
     weigh_doubts,
 )
-from stitch.plugins.intake.folder_files import FolderFiles, angles_in_names, find_folder_files
+from stitch.plugins.intake.folder_files import FolderFiles, angles_in_names, find_folder_files, lens_of
 from stitch.plugins.intake.guesses import Because, Guess
 from stitch.plugins.intake.inventory import several_lists
 from stitch.plugins.intake.layouts import (
@@ -60,7 +60,6 @@ from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES
-from stitch.session.reading.intrinsics import find_intrinsics
 from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
 from stitch.session.thinning import distinct_points, thin_session
@@ -131,7 +130,7 @@ def _session_of(found: FolderFiles, stated: StatedFolder) -> FirstSession:
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
     ways_to_read = all_readings(raw, found.urdf, stated)
-    units = candidate_units(ways_to_read, stated)
+    units = candidate_units(ways_to_read, stated, own_units[0])
     if all(_is_profile(cloud) for cloud in points):
         way = all_interpretations(ways_to_read, pairs, units, (True,))[0]
         return _profiles_of_a_sphere(found, raw, clouds, way, stated)
@@ -209,10 +208,15 @@ def _decide(
         require_no_background(found.folder, capture, mm)
         return register_scan_pairs(capture)
 
-    def choose(among: Sequence[Reading]) -> ConventionChoice:
+    def choose(among: Sequence[Reading], units: Sequence[str] = units) -> ConventionChoice:
         return choose_convention(capture, motions, among, pairs, units, stated.carries, shown)
 
     decided = choose(ways_to_read)
+    own = next(unit for unit, metres in CLOUD_UNITS.items() if metres == mm * MM)
+    if not decided.determined and not stated.length_unit and own not in units:
+        # Positions near the origin look like those of a robot in a larger unit.
+        in_own = choose(ways_to_read, [own])
+        decided = in_own if in_own.determined else decided
     require_own_frames(found.folder, motions, decided)
     if not decided.determined and len(pairs[0].used) == len(found.clouds):
         ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
@@ -399,8 +403,8 @@ def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder)
     factor = near if abs(scale / near - 1) < _ROUND_NEAR else float(f"{scale:.4g}")
     first = files.clouds[0]
     told = f"the clouds are {scale:.4g} times as large as the robot's motions"
-    if first.suffix.lower() in DEPTH_SUFFIXES:
-        camera = find_intrinsics(first)
+    camera = lens_of(first)
+    if camera is not None and camera.pitch is None:
         per_metre = (camera.units_per_metre or 1000.0) * factor
         words = f'write depth_scale = {per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
         raise Refusal(

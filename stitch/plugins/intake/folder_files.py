@@ -19,8 +19,8 @@ from stitch.plugins.intake.raw_poses import ARRAYS, RawPoses, read_by_its_progra
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
-from stitch.session.reading.intrinsics import find_intrinsics
-from stitch.session.reading.scan_files import ptx_scans
+from stitch.session.reading.intrinsics import Intrinsics, find_intrinsics
+from stitch.session.reading.scan_files import ptx_scans, read_text_columns
 from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.reading.text_files import WORKBOOKS, readable
 from stitch.system.packages import import_extra
@@ -28,6 +28,9 @@ from stitch.system.packages import import_extra
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
 _EITHER = (".txt", ".csv", ".asc")
 _CLOUD_LINES = 400
+_FEWEST_SCANS, _FEWEST_POINTS = 3, 25
+# Bytes of other things are hardly all numbers of such sizes.
+_RECORDS = (1e-3, 1e6)
 # A recording of a robot is as long as a scan; the names of its columns tell them apart.
 _RECORDINGS = 2
 _RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat", re.IGNORECASE), 4096
@@ -35,7 +38,7 @@ _RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat"
 
 def clouds_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Files of the kind that most clouds have, and clouds of other kinds."""
-    fitting = [f for f in files if f.suffix.lower() in CLOUD_SUFFIXES and _is_cloud(f)]
+    fitting = [f for f in files if f.suffix.lower() in CLOUD_SUFFIXES and _is_cloud(f)] or _short_clouds(files)
     if not fitting:
         return [], []
     kinds = Counter(f.suffix.lower() for f in fitting)
@@ -49,6 +52,9 @@ def _is_cloud(file: Path) -> bool:
         return _is_cloud_array(file) or is_depth_image(file)
     if file.suffix.lower() in DEPTH_SUFFIXES:
         return is_depth_image(file)
+    if file.suffix.lower() == ".bin":
+        head = np.fromfile(file, "<f4", _HEADER // 4)
+        return file.stat().st_size % 16 == 0 and bool(_RECORDS[0] < np.abs(head).max(initial=0.0) < _RECORDS[1])
     if file.suffix.lower() not in _EITHER:
         return True
     with file.open("rb") as stream:
@@ -56,6 +62,19 @@ def _is_cloud(file: Path) -> bool:
             return False
         stream.seek(0)
         return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
+
+
+def _short_clouds(files: Sequence[Path]) -> list[Path]:
+    """Texts named alike that hold points and nothing beside, as profiles do: each more rows than there are files."""
+    alike = [f for f in files if f.suffix.lower() in _EITHER]
+    kinds = Counter((f.parent, re.sub(r"\d+", "#", f.name)) for f in alike)
+    out = []
+    for file in alike:
+        count = kinds[file.parent, re.sub(r"\d+", "#", file.name)]
+        with suppress(InputError, ValueError):
+            if count >= _FEWEST_SCANS and len(read_text_columns(file)["x"]) > max(count, _FEWEST_POINTS):
+                out.append(file)
+    return out
 
 
 def _is_cloud_array(file: Path) -> bool:
@@ -111,7 +130,8 @@ class FolderFiles:
     @property
     def unused(self) -> tuple[Path, ...]:
         """Clouds of another kind and other files of poses."""
-        used = (*self.poses, *_lenses(self.clouds))
+        lens = lens_of(self.clouds[0])
+        used = (*self.poses, *([lens.source] if lens else []))
         aside = (*self.others, *(f for found in self.lists for f in found.files))
         return tuple(dict.fromkeys(f for f in aside if f not in used))
 
@@ -175,13 +195,11 @@ def _file_and_part(poses: Path | None) -> tuple[Path | None, str]:
     return poses.with_name(name), part
 
 
-def _lenses(clouds: Sequence[Path]) -> list[Path]:
-    """The file of the camera of depth images, which is used though it holds no pose."""
-    if clouds[0].suffix.lower() not in DEPTH_SUFFIXES:
-        return []
+def lens_of(cloud: Path) -> Intrinsics | None:
+    """Return the camera of a depth image, whose file is used though it holds no pose; None of other scans."""
     with suppress(InputError):
-        return [Path(find_intrinsics(clouds[0]).source)]
-    return []
+        return find_intrinsics(cloud) if cloud.suffix.lower() in DEPTH_SUFFIXES else None
+    return None
 
 
 # Angles of a turntable in names: scan_020deg, angle_45.5, 120°.

@@ -320,10 +320,10 @@ _SIZE_M, _RANGE_M = (5e-3, 10.0), 12.0
 _USUAL_REACH_M, _SAME_SCALE = 0.9, 0.05
 
 
-def pose_units(position: Array) -> list[str]:
-    """Units that positions (V, 3) can have, the usual first; mm if none is plausible."""
+def pose_units(position: Array, otherwise: str = "mm") -> list[str]:
+    """Units that positions (V, 3) can have, the usual first; `otherwise` if none is plausible."""
     reach = float(np.linalg.norm(position, axis=1).max(initial=0.0))
-    return [u for u, m in POSE_UNITS.items() if _REACH_M[u][0] <= reach * m <= _REACH_M[u][1]] or ["mm"]
+    return [u for u, m in POSE_UNITS.items() if _REACH_M[u][0] <= reach * m <= _REACH_M[u][1]] or [otherwise]
 
 
 def cloud_units(clouds: Sequence[Array]) -> list[str]:
@@ -350,7 +350,7 @@ def unit_pairs(position: Array, clouds: Sequence[Array], factor: float) -> list[
         pairs,
         key=lambda pair: (
             *(u not in ("mm", "m") for u in pair),
-            abs(np.log(reach * POSE_UNITS[pair[0]] / _USUAL_REACH_M)),
+            abs(np.log(max(reach, 1e-9) * POSE_UNITS[pair[0]] / _USUAL_REACH_M)),
         ),
     )
 

@@ -33,7 +33,7 @@ def nested_lists(document: Any, texts: tuple[str, ...] = ()) -> dict[str, list[P
         direct = [(words, row) for words, row in named if row is not None]
         # gripper_1, target_1, gripper_2 … are two lists.
         stems = Counter(_LAST_NUMBER.sub("#", words[0]) for words, _ in direct)
-        several = len(stems) > 1 and min(stems.values()) > 1
+        several = len(stems) > 1 and (min(stems.values()) > 1 or len({tuple(row) for _, row in direct}) > 1)
         for stem in stems if several else [""]:
             alike = [(words, row) for words, row in direct if not stem or _LAST_NUMBER.sub("#", words[0]) == stem]
             if len(alike) > 1 and len({tuple(row) for _, row in alike}) == 1:

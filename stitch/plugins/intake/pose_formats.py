@@ -224,6 +224,15 @@ def _colmap_rows(text: str) -> list[PoseRow]:
     return rows
 
 
+_STANFORD = re.compile(r"^bmesh\s+(\S+)" + rf"\s+({_POINTED})" * 7 + r"\s*$", re.MULTILINE)
+
+
+def _stanford_rows(text: str) -> list[PoseRow]:
+    """Rows of the .conf of Stanford's range scans; its quaternion turns from the common frame into the scan's."""
+    rows = ((m[1], np.array(_floats(m.groups()[1:]))) for m in _STANFORD.finditer(text))
+    return [((name,), posed(frames.make(Rotation.from_quat(x[3:]).inv().as_matrix(), x[:3]))) for name, x in rows]
+
+
 def open3d_rows(document: Any) -> list[PoseRow] | None:
     """Return the nodes of Open3D's PoseGraph, or the cameras of a PinholeCameraTrajectory; None of others."""
     kind = document.get("class_name") if isinstance(document, dict) else None
@@ -261,6 +270,7 @@ _FORMATS: tuple[tuple[str, Callable[[str], list[PoseRow]]], ...] = (
     ("a pose file of HALCON", _halcon_rows),
     ("4×4 matrices with words between", _matrix_rows),
     ("images of COLMAP, inverted to T_world_camera", _colmap_rows),
+    ("alignment of Stanford's range scans", _stanford_rows),
     ("tf_echo of ROS", _tf_echo_rows),
     ("robtargets of ABB", partial(_matched_rows, _ROBTARGET, ("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz"))),
     ("poses p[…] of Universal Robots", partial(_matched_rows, _UR_POSE, _UR_NAMES)),

@@ -37,6 +37,9 @@ _ORTHONORMAL = 1e-2
 # An axis of rotation has length 1 within this; a larger angle is in degrees.
 _UNIT_AXIS, _TURN = 1e-3, 2 * np.pi + 1e-3
 _MAX_POSES_MB = 50
+# 3DTK: angles about x, y, z that turn along, in a left-handed frame; what its numbers are where z points the other way.
+_NAMES_OF_3DTK = ("x [cm]", "y [cm]", "z [cm]", "omega [deg]", "phi [deg]", "kappa [deg]")
+_MIRRORED = (1.0, 1.0, -1.0, -1.0, -1.0, 1.0)
 _ROWS_SHOWN = 3
 # Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
 _FEWEST_WHOLE = 0.6
@@ -269,7 +272,7 @@ def _raw_poses(
 
 def _axis_times_angle(header: tuple[str, ...], numbers: Array) -> tuple[tuple[str, ...], Array]:
     """Return columns with an axis of length 1 and the angle about it, rad or degrees, as one vector of rotation."""
-    axis = [i for i, name in enumerate(header) if re.search(r"axis[._]?[0-2xyz]$", name, re.IGNORECASE)]
+    axis = [i for i, name in enumerate(header) if re.search(r"axis[._]?[0-2xyz]$|^[akun]_?[xyz]$", name, re.IGNORECASE)]
     angle = [i for i, name in enumerate(header) if re.search(r"angle([._\s]*(rad|deg))?\W*$", name, re.IGNORECASE)]
     if len(axis) != 3 or len(angle) != 1:
         return header, numbers
@@ -283,8 +286,15 @@ def _axis_times_angle(header: tuple[str, ...], numbers: Array) -> tuple[tuple[st
 
 
 def _matrix_blocks(table: NumberTable) -> RawPoses | None:
-    """4×4 matrices, or 3×4 ones, over several lines each; None if the table is none of that."""
+    """4×4 or 3×4 matrices over several lines each, or one position above its angles; None if it is none of that."""
     x = table.numbers
+    if x.shape == (2, 3):
+        of_3dtk = table.file.with_suffix(".3d").exists()
+        words = (
+            "a pose of 3DTK, z the other way round as of its scans" if of_3dtk else "position and angles, a line each"
+        )
+        header, sense = (_NAMES_OF_3DTK, _MIRRORED) if of_3dtk else (None, 1.0)
+        return _raw_poses(str(table.file), header, x.reshape(1, 6) * sense, ((),), words)
     for height in (4, 3) if x.shape[1] == 4 else ():
         blocks = x.reshape(-1, height, 4) if len(x) % height == 0 else x[:0, None]
         whole = blocks[np.isfinite(blocks).all(axis=(1, 2))]

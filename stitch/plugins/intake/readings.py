@@ -285,12 +285,15 @@ def with_uncoupled_joints(reading: Reading, urdf: Path | None) -> Reading:
     return replace(reading, layout=replace(layout, joints=best.layout.joints, words=words))
 
 
-def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[str]:
-    """Units that positions can have of which the file does not say it: stated, or plausible."""
+def candidate_units(readings: Sequence[Reading], stated: StatedTable, otherwise: str = "mm") -> list[str]:
+    """Units that positions can have of which the file does not say it: stated, or plausible; else that of the clouds.
+
+    Positions near the origin, as of a turntable or of scans that are registered already, are plausible in none.
+    """
     if stated.length_unit:
         return [stated.length_unit]
     open_ = [r for r in readings if r.layout.length_unit is None]
-    return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3]))) or ["mm"]
+    return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3], otherwise))) or ["mm"]
 
 
 JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"

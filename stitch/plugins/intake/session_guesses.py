@@ -12,6 +12,9 @@ from stitch.plugins.intake.layouts import POSE_UNITS, covariate_columns, size_wo
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.stated_folder import StatedFolder
 
+# Positions nearer to the origin are none of an arm.
+_NEAR_M = 0.08
+
 
 def session_guesses(
     files: FolderFiles,
@@ -111,7 +114,12 @@ def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess
     if way.reading.layout.length_unit:
         return Guess("length_unit", way.length_unit, "told by the file", True, "--unit")
     metres = reach * POSE_UNITS[way.length_unit]
-    reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {score_words(decided.best)}"
+    where = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do"
+    if metres < _NEAR_M:
+        where = (
+            f"positions reach {reach:.4g}, as of a turntable or of registered scans; taken to be in the clouds' unit"
+        )
+    reason = f"{where}; {score_words(decided.best)}"
     # The motions of the scans have a scale only where the unit of the clouds is known.
     by: Because = "scans" if stated.cloud_unit else "usual"
     states = {"unit": way.length_unit}
@@ -130,7 +138,8 @@ def _cloud_unit_guess(
     other = own_units[1] if len(own_units) > 1 else None
     counted = files.clouds[0].suffix.lower() in (".png", ".tif", ".tiff")
     words = "; whole numbers of depth are mm unless the intrinsics state depth_scale" * counted
-    known = stated.length_unit or decided.best.interpretation.reading.layout.length_unit
+    layout = decided.best.interpretation.reading.layout
+    known = stated.length_unit or (layout.length_unit and not layout.turntable)
     by: Because = "scans" if known and decided.determined else "usual"
     reason = f"{size_words(clouds)}{words}"
     states, rival = {"cloud_unit": own_units[0]}, {"cloud_unit": other} if other else {}

@@ -17,9 +17,11 @@ from stitch.session.reading.scan_files import (
     read_array,
     read_e57,
     read_las,
+    read_left_handed,
     read_mesh,
     read_ply,
     read_ptx,
+    read_records,
     read_text_columns,
     read_zdf,
 )
@@ -38,6 +40,8 @@ _READERS: dict[str, Callable[[Path], dict[str, Array]]] = {
     ".las": read_las,
     ".laz": read_las,
     ".zdf": read_zdf,
+    ".3d": read_left_handed,
+    ".bin": read_records,
     **dict.fromkeys(DEPTH_SUFFIXES, read_depth_columns),
 }
 CLOUD_SUFFIXES = tuple(_READERS)

@@ -1,5 +1,7 @@
 """Depth images (PNG, TIFF, EXR, NPY) with intrinsics as points: distance along the axis, 0 where nothing was seen.
 
+Images of heights have a pitch in place of the intrinsics.
+
 Points keep the file's unit: millimetres where whole numbers are stored, as sensors do, metres in floating point; or
 metres where the intrinsics state `depth_scale`.
 """
@@ -45,12 +47,15 @@ def is_depth_image(path: Path) -> bool:
 
 
 def read_depth(path: Path) -> Array:
-    """Return (H, W, 3) points, camera frame, NaN where nothing was measured.
+    """Return (H, W, 3) points, camera frame, NaN where nothing was measured; an EXR may hold them as they are.
 
     Raises:
         InputError: no depth image, no intrinsics, or those of another size of image.
     """
-    return lifted(path, _pixels(path), find_intrinsics(path))
+    pixels = _pixels(path)
+    if pixels.ndim == 3:
+        return np.where(pixels.any(axis=2, keepdims=True), pixels, np.nan)
+    return lifted(path, pixels, find_intrinsics(path))
 
 
 def read_depth_columns(path: Path) -> dict[str, Array]:
@@ -60,7 +65,7 @@ def read_depth_columns(path: Path) -> dict[str, Array]:
 
 
 def _pixels(path: Path) -> Array:
-    """Return (H, W) numbers as stored."""
+    """Return (H, W) numbers as stored, or (H, W, 3) points."""
     from PIL import Image
 
     if path.suffix.lower() == ".npy":
@@ -80,8 +85,13 @@ def _exr(path: Path) -> Array:
     require_exr_room(path)
     with import_extra("OpenEXR", path, "formats").File(str(path)) as file:
         channels = {name: np.asarray(channel.pixels, float) for name, channel in file.channels().items()}
+    if all(axis in channels for axis in "XYZ"):
+        return np.dstack([channels[axis] for axis in "XYZ"])
     name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
-    return channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
+    several = channels[name].ndim == 3 and np.ptp(channels[name][..., :3], axis=2).any()
+    return (
+        channels[name][..., :3] if several else channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
+    )
 
 
 def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
@@ -95,6 +105,12 @@ def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
         InputError: the intrinsics are those of another size of image.
     """
     height, width = depth.shape
+    if camera.pitch is not None:
+        # Rows of an image run down, heights up.
+        x, y, up = camera.pitch
+        rows, columns = np.indices(depth.shape)
+        z = np.where(np.isfinite(depth) & (depth != 0), depth * up, np.nan)
+        return np.dstack([columns * x, -rows * y, z])
     if camera.size is not None and camera.size != (width, height):
         raise InputError(
             f"{where}: {width}×{height} pixels, {camera.source.name} is of {camera.size[0]}×{camera.size[1]}; to fix: "

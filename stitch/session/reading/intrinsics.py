@@ -1,7 +1,8 @@
 """A camera's intrinsics, from the file that lies beside a depth image.
 
 Read as tools write them: ROS camera_info and OpenCV's YAML (camera_matrix, or K and D), Open3D's JSON (intrinsic_matrix
-by columns), RealSense's (fx, fy, ppx, ppy, coeffs), Zivid's YAML (FX, FY, CX, CY, K1 …), a 3×3 matrix as text.
+by columns), RealSense's (fx, fy, ppx, ppy, coeffs), Zivid's YAML (FX, FY, CX, CY, K1 …), a 3×3 matrix as text. Of an
+image of heights: pitch_x, pitch_y, from pixel to pixel, and z_scale, what a count is high.
 """
 
 import json
@@ -17,10 +18,16 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.session.reading.text_files import read_text, shortened
 
-_NAMED = re.compile(r"intrinsic|camera_?info|calib|camera|^k$", re.IGNORECASE)
+_NAMED = re.compile(r"intrinsic|camera_?info|calib|camera|^k$|pitch|height|surface", re.IGNORECASE)
+_PITCH = re.compile(
+    r"(pitch|pixel_?size|spacing|resolution|scale)_?([xyz])|([xyz])_?(pitch|pixel_?size|spacing|resolution|scale)"
+)
 _ENDINGS = (".json", ".yaml", ".yml", ".txt")
 _LARGEST_MB = 5.0
-_FIX = "to fix: put them beside it or in the folder above, as intrinsics.json with fx, fy, cx, cy"
+_FIX = (
+    "to fix: put them beside it or in the folder above, as intrinsics.json with fx, fy, cx, cy, or with pitch_x, "
+    "pitch_y of heights"
+)
 # Units per metre are more, metres per unit less: what lies between means neither.
 _PER_METRE = 50.0
 _METRES_PER = 0.02
@@ -38,6 +45,7 @@ class Intrinsics:
     distortion: Array  # (n,) k1, k2, p1, p2, k3 …; none where all are zero
     size: tuple[int, int] | None  # width, height
     units_per_metre: float | None  # of the depth, where the file states it
+    pitch: tuple[float, float, float] | None = None  # of heights: from pixel to pixel along x and y, and of a count
 
 
 def find_intrinsics(image: Path) -> Intrinsics:
@@ -97,6 +105,10 @@ def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
 
 def _intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
     matrix = _camera_matrix(level)
+    named = {m[2] or m[3]: level[name] for name in level if (m := _PITCH.match(name))} if matrix is None else {}
+    if {"x", "y"} <= named.keys() and all(isinstance(step, (int, float)) and step > 0 for step in named.values()):
+        pitch = (float(named["x"]), float(named["y"]), float(named.get("z", 1.0)))
+        return Intrinsics(file, 1.0, 1.0, 0.0, 0.0, np.zeros(0), None, None, pitch)
     if matrix is None:
         return None
     fx, fy, cx, cy = matrix

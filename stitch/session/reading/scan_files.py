@@ -89,6 +89,8 @@ def read_text_columns(path: Path) -> dict[str, Array]:
         lines = lines[1:]
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}
+    if lines[0].strip() == "Info":
+        return _columns_of_gocator(path, lines)
     if _DECIMAL_COMMAS.fullmatch(lines[-1].strip()):
         filled = [line.replace(",", ".") for line in filled]
         lines = [line.replace(",", ".") for line in lines]
@@ -103,6 +105,30 @@ def read_text_columns(path: Path) -> dict[str, Array]:
         return {name: np.empty(0) for name in names}
     table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
     return dict(zip(names, table.T, strict=True))
+
+
+# Sections of surfaces in a CSV of Gocator: attributes in two lines, then names above the rows.
+_SURFACES, _POINTS = ("Part", "Surface"), "SurfacePointCloud"
+
+
+def _columns_of_gocator(path: Path, lines: list[str]) -> dict[str, Array]:
+    """Return x, y, z (N,) of a surface: heights over x in the header and y in each row, or points side by side."""
+    begins = [i for i, line in enumerate(lines) if line.strip(" ,\r") in (*_SURFACES, _POINTS)]
+    if not begins:
+        raise InputError(f"{path}: holds no surface; export the surface, not its profiles")
+    end = next(i for i in range(begins[0], len(lines) + 1) if i == len(lines) or lines[i].startswith("End"))
+    head, *rows = ([cell.strip() for cell in line.split(",")] for line in lines[begins[0] + 3 : end])
+    if lines[begins[0]].startswith(_POINTS):
+        numbers = np.array([float(cell or "nan") for row in rows for cell in row if is_number(cell or "nan")])
+        return measured_pixels(dict(zip("xyz", numbers[: len(numbers) // 3 * 3].reshape(-1, 3).T, strict=True)))
+    across = [i for i, name in enumerate(head) if is_number(name)]
+    kept = [row for row in rows if "I" not in row[: across[0]]]  # brightness has rows of its own
+    z = np.array([[float(row[i] or "nan") for i in across] for row in kept])
+    y = np.array([float(row[head.index("Y") if "Y" in head else 0]) for row in kept])
+    grid = np.broadcast_arrays(np.array([float(head[i]) for i in across]), y[:, None], z)
+    return measured_pixels(
+        {axis: np.where(np.isnan(z), np.nan, c).ravel() for axis, c in zip("xyz", grid, strict=True)}
+    )
 
 
 def _column_names(line: str, separator: str | None) -> list[str]:
@@ -142,6 +168,22 @@ def read_array(path: Path) -> dict[str, Array]:
     names = [*"xyz", *(f"scalar_{i}" for i in range(table.shape[1] - 3))]
     columns = dict(zip(names, table.T, strict=True))
     return measured_pixels(columns) if array.ndim == 3 else columns
+
+
+def read_records(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of a .bin without a header: x, y, z and brightness in 32 bits each, as KITTI has them."""
+    return dict(zip((*"xyz", "intensity"), np.fromfile(path, "<f4").reshape(-1, 4).T.astype(float), strict=True))
+
+
+def read_left_handed(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of a .3d of 3DTK, whose axes are left-handed, with z the other way round.
+
+    The first line may state how many points follow, or how many rows and columns.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    first = lines[0].split()
+    table = np.loadtxt(lines[len(first) < 3 or "x" in first :], ndmin=2)
+    return dict(zip("xyz", table[:, :3].T * [[1], [1], [-1]], strict=True))
 
 
 def read_ptx(path: Path) -> dict[str, Array]:

@@ -215,3 +215,15 @@ def test_the_word_next_to_a_pose_is_its_name():
     rows = ["# cell 3, 2024-03-11 10:00", *(f"scan_{i} p[0.{i}, 0.2, 0.3, 0.1, 0.2, 0.3]" for i in range(3))]
     ((found, _),) = read_pose_text("\n".join(rows)).values()
     assert [labels for labels, _ in found] == [("scan_0",), ("scan_1",), ("scan_2",)]
+
+
+def test_the_conf_of_stanford_turns_by_the_inverse_of_its_quaternion(tmp_path):
+    """As zipper and the alignments that people publish read it: p' = R(q)ᵀ p + t, and the camera is none of the scans."""
+    rows = [
+        f"bmesh bun{i:03d}.ply " + " ".join(f"{x:.9f}" for x in (*p, *q))
+        for i, (p, q) in enumerate(zip(P, R.inv().as_quat(), strict=True))
+    ]
+    (tmp_path / "bun.conf").write_text("\n".join(["camera -0.01 -0.09 -0.7 0 0 0 1", *rows]))
+    raw = read_raw_poses([tmp_path / "bun.conf"])
+    assert [labels[0] for labels in raw.labels] == ["bun000.ply", "bun001.ply", "bun002.ply"]
+    assert np.allclose(readings(possible_layouts(raw)[0])[0].T, T, atol=1e-6)

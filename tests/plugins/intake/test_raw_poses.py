@@ -424,3 +424,27 @@ def test_matlabs_cells_and_arrays_of_structs_are_lists(tmp_path):
     assert np.array_equal(read_lists(tmp_path / "cells.mat")[0].numbers, T.reshape(3, 16))
     savemat(tmp_path / "structs.mat", {"pose": np.array([{"R": M[:3, :3], "t": M[:3, 3]} for M in T])})
     assert read_lists(tmp_path / "structs.mat")[0].numbers[:, 9:].tolist() == T[:, :3, 3].tolist()
+
+
+def test_the_pose_of_3dtk_is_mirrored_as_its_scans_are(tmp_path):
+    """R = Rx Ry Rz of angles in degrees, positions in cm, in a left-handed frame: with z the other way round S T S."""
+    S = np.diag([1.0, 1.0, -1.0])
+    angles, position = np.array([20.0, -35.0, 110.0]), np.array([12.5, -3.0, 40.0])
+    for i in range(3):
+        (tmp_path / f"scan{i:03d}.3d").write_text("1 2 3\n")
+        (tmp_path / f"scan{i:03d}.pose").write_text("12.5 -3 40\n20 -35 110\n")
+    raw = read_raw_poses(sorted(tmp_path.glob("*.pose")))
+    layout = possible_layouts(raw)[0]
+    assert layout.length_unit == "cm"
+    T = readings(layout)[0].T[0]
+    turns = [
+        Rotation.from_euler(axis, angle, degrees=True).as_matrix() for axis, angle in zip("xyz", angles, strict=True)
+    ]
+    assert np.allclose(T[:3, :3], S @ turns[0] @ turns[1] @ turns[2] @ S) and np.allclose(T[:3, 3], S @ position)
+
+
+def test_a_position_above_its_angles_is_a_pose_a_file(tmp_path):
+    for i in range(3):
+        (tmp_path / f"p{i}.txt").write_text(f"{400 + i} -300 {500 + 9 * i}\n10.5 {20 + 7 * i} -130\n")
+    raw = read_raw_poses(sorted(tmp_path.glob("*.txt")))
+    assert raw.numbers.shape == (3, 6) and possible_layouts(raw)[0].words.startswith("columns 1 to 3 are the position")

@@ -341,3 +341,40 @@ def test_a_text_cloud_with_decimal_commas_is_read(tmp_path, row):
     rows = "".join(row.format(*(f"{value + 0.25:.2f}".replace(".", ",") for value in corner)) for corner in CORNERS)
     (tmp_path / "c.txt").write_text(f"{len(CORNERS)}\n{rows}", encoding="utf-8")
     np.testing.assert_allclose(read_cloud(tmp_path / "c.txt").points, CORNERS + 0.25)
+
+
+def test_records_of_kitti_are_points_and_brightness(tmp_path):
+    np.column_stack([POINTS, np.ones(500)]).astype("<f4").tofile(tmp_path / "000000.bin")
+    cloud = read_cloud(tmp_path / "000000.bin")
+    assert np.allclose(cloud.points, POINTS, atol=1e-4) and (cloud.scalars["intensity"] == 1).all()
+
+
+@pytest.mark.parametrize("head", ["", "500\n", "25 x 20\n"])
+def test_the_left_handed_axes_of_3dtk_become_right_handed(tmp_path, head):
+    rows = "\n".join(f"{x:.9f} {y:.9f} {z:.9f} 17" for x, y, z in POINTS * [1, 1, -1])
+    (tmp_path / "scan000.3d").write_text(head + rows)
+    assert np.allclose(read_cloud(tmp_path / "scan000.3d").points, POINTS, atol=1e-8)
+
+
+def test_lines_of_a_ply_header_that_other_programs_add_are_passed_over(tmp_path):
+    (tmp_path / "c.ply").write_text(
+        "ply\nformat ascii 1.0\nTextureFile scan.png\nelement vertex 2\nproperty float x\nproperty float y\n"
+        "property float z\nend_header\n1 2 3\n4 5 6\n"
+    )
+    assert np.array_equal(read_cloud(tmp_path / "c.ply").points, [[1, 2, 3], [4, 5, 6]])
+
+
+GOCATOR = "Info\nCSV Version,Sensor Count\n2,1\nEnd\nDeviceInfo\nID,Model\n13434,2330\nEnd\n"
+
+
+@pytest.mark.parametrize(
+    "section",
+    [
+        "Part\nFrame,Source\n0,0\nY,-1.5,0.5\n10,,7.25\n12,7.5,8\nEnd\n",
+        "Surface\nFrame,Source\n0,0\nFrame,Y,Axis,-1.5,0.5\n1,10,Z,,7.25\n1,10,I,9,9\n1,12,Z,7.5,8\nEnd\n",
+        "SurfacePointCloud\nFrame,Source\n0,0\nx,y,z\n0.5,10,7.25,-1.5,12,7.5\n0.5,12,8,,,\nEnd\n",
+    ],
+)
+def test_surfaces_of_gocator_in_each_of_its_sections(tmp_path, section):
+    (tmp_path / "scan.csv").write_text(GOCATOR + section)
+    assert np.array_equal(read_cloud(tmp_path / "scan.csv").points, [[0.5, 10, 7.25], [-1.5, 12, 7.5], [0.5, 12, 8]])

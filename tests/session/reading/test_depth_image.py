@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stitch.errors import InputError
 from stitch.session.reading.clouds import read_cloud
@@ -134,3 +135,21 @@ def test_a_picture_of_another_size_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "color_1.png"), np.full((40, 60, 3), 90, np.uint8))
     with pytest.raises(InputError, match="aligned to the depth"):
         read_range_image(tmp_path / "depth_1.png")
+
+
+def test_heights_with_their_pitch_are_points_whose_rows_run_down(tmp_path):
+    heights = np.array([[0, 1.5, 2.0], [-0.5, 0.25, 3.0]], np.float32)
+    Image.fromarray(heights).save(tmp_path / "scan.tif")
+    (tmp_path / "heights.json").write_text('{"pitch_x": 0.5, "pitch_y": 0.25, "z_scale": 2.0}')
+    expected = [[0.5, 0, 3], [1, 0, 4], [0, -0.25, -1], [0.5, -0.25, 0.5], [1, -0.25, 6]]
+    assert np.array_equal(read_cloud(tmp_path / "scan.tif").points, expected)
+
+
+@pytest.mark.parametrize("names", [("X", "Y", "Z"), ("RGB",)])
+def test_three_channels_of_an_exr_are_points(tmp_path, names):
+    OpenEXR = needs("OpenEXR", "formats")
+    points = np.random.default_rng(0).normal(size=(4, 5, 3)).astype(np.float32)
+    points[1, 2] = 0.0  # nothing was measured there
+    channels = {"RGB": points} if len(names) == 1 else dict(zip(names, np.moveaxis(points, 2, 0).copy(), strict=True))
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "scan.exr"))
+    assert np.array_equal(read_cloud(tmp_path / "scan.exr").points, points[points.any(axis=2)])
