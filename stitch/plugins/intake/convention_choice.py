@@ -127,7 +127,7 @@ def _small(off: Array) -> bool:
 # Ways that the dear judge sees: the best of each cheap one.
 _SHORT = 4
 # Motions that closed give a start for the surfaces; and so many of them leave no doubt of a pairing.
-_CLOSED, _MOST_CLOSED = 0.5, 0.85
+_CLOSED, MOST_CLOSED = 0.5, 0.85
 # Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
 # (see CLEARLY_BETTER) tells it.
 _TWICE, BY_CHANCE = 1.9, 1.12
@@ -192,7 +192,7 @@ def choose_convention(
         first = _choose_interpretation(capture, ways, motions())
     rows = {row for pairing in pairs for row in pairing.rows}
     # Under a pairing that goes wrong in the middle the motions before it close all the same.
-    closes = first.best.closed is None or first.best.closed >= _MOST_CLOSED
+    closes = first.best.closed is None or first.best.closed >= MOST_CLOSED
     nothing_left = None not in pairs[0].rows and len({*pairs[0].rows}) == len(rows | {*pairs[0].rows})
     if len(pairs) == 1 or (first.determined and nothing_left and closes):
         return first

@@ -15,6 +15,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing, pairings, stated_pairing
 from stitch.plugins.intake.convention_choice import (
+    MOST_CLOSED,
     ConventionChoice,
     ConventionScore,
     Interpretation,
@@ -55,7 +56,7 @@ from stitch.plugins.intake.scan_targets import find_folder_targets, target_motio
 from stitch.plugins.intake.session_guesses import session_guesses
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.plugins.intake.stops import rows_with_scans
-from stitch.plugins.intake.sudden_change import require_no_change
+from stitch.plugins.intake.sudden_change import require_no_change, require_one_part
 from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
@@ -138,7 +139,7 @@ def _session_of(found: FolderFiles, stated: StatedFolder) -> FirstSession:
     shown = target_motions(seen) if seen else None
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     decided, scale = _decide(
-        found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
+        found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown, every, kept
     )
     decided = _uncoupled(decided, found.urdf)
     alike = _units_of_scale(scale, decided, points, own_units[0], stated)
@@ -187,6 +188,8 @@ def _decide(
     open_: tuple[Sequence[Pairing], Sequence[str]],
     stated: StatedFolder,
     shown: RelativeScans | None,
+    every: FolderFiles,
+    kept: Sequence[int],
 ) -> tuple[ConventionChoice, float | None]:
     """Let the scans choose among the readings, and among those that the names of columns deny.
 
@@ -196,6 +199,7 @@ def _decide(
         scans: made light, mm, and the unit of their files in mm.
         open_: pairings and units of length that are possible.
         shown: motions that targets show.
+        every: with the clouds that show nothing, of which `kept` are the others.
 
     Raises:
         InputError: scans that stand still, or lie in one frame.
@@ -218,9 +222,12 @@ def _decide(
         in_own = choose(ways_to_read, [own])
         decided = in_own if in_own.determined else decided
     require_own_frames(found.folder, motions, decided)
-    if not decided.determined and len(pairs[0].used) == len(found.clouds):
+    closes = decided.determined and (decided.best.closed is None or decided.best.closed >= MOST_CLOSED)
+    if not closes and len(pairs[0].used) == len(found.clouds):
         ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
-        require_no_change(found.clouds, motions(), ways)
+        require_no_change(every.clouds, motions(), ways, kept)
+    if decided.determined:
+        require_one_part(every.clouds, capture, decided.best, kept)
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
     if not decided.determined:

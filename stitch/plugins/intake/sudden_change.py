@@ -1,18 +1,19 @@
-"""A tool, scanner, part or base that changed: at one view, or two lists of poses that are mixed in one table.
+"""A tool, scanner, part or base that changed: at one view, or two lists of poses, or parts, that are mixed.
 
 Where the robot's poses T_i carry the mount's frame and X is the hand-eye, another tool makes them T_i D for some of the
 views, another base B T_i. The first shows in the hand-eyes of the two groups, the second in the motions between them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Mask
-from stitch.plugins.intake.convention_choice import Interpretation
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.plugins.intake.convention_choice import ConventionScore, Interpretation
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.screening.conventions import fit_hypotheses
@@ -26,6 +27,7 @@ from stitch.screening.motions import (
     fit_motions,
     rotation_angles,
 )
+from stitch.session.capture import Capture
 
 # Motions of a group, and of all with the change undone, that close: scans of a symmetric part register wrongly now and
 # then. Those that stay open are so much fewer than as it stands.
@@ -35,20 +37,73 @@ _FEWEST_VIEWS = 3
 _TRIED, _REFITS = 2, 2
 # A change of less, mm and rad, is none.
 _CHANGE_MM, _CHANGE_RAD = 1.0, 2e-3
+# Two scans lie on each other where half of the points of either, on average, lie within this share of the part's size
+# of the other. Where a point lies nearer to a scanner than what it saw there, by this share, one of both was not there.
+_ON, _NEAR, _BEFORE = 0.5, 0.01, 0.05
+# Shares of such points, in the middle of all pairs: between the groups at least, within them at most.
+_BETWEEN, _WITHIN = 0.04, 0.015
+# Points of a scan that are asked, and scans before and behind it in the list that they are held against.
+_ASKED, _NEIGHBOURS = 300, 4
 
 
-def require_no_change(clouds: Sequence[Path], motions: RelativeScans, ways: Sequence[Interpretation]) -> None:
+def require_one_part(clouds: Sequence[Path], capture: Capture, best: ConventionScore, rows: Sequence[int]) -> None:
+    """Refuse scans of two groups that lie on each other within each, and not between them, where they show one place.
+
+    Args:
+        clouds: of the folder, in the order of their names.
+        best: poses that fit.
+        rows: of the capture's scans among the clouds.
+
+    Raises:
+        InputError: names the scans of either group.
+    """
+    hypothesis = best.interpretation.hypothesis(0)
+    poses, used = hypothesis.T_reference_mount @ best.T_mount, best.interpretation.pairing.used
+    if len(used) < 2 * _FEWEST_VIEWS:
+        return
+    pairs = [(v, w) for v in used for w in used if v != w and abs(v - w) <= _NEIGHBOURS]
+    scans = [scan.points for scan in capture.scans]
+    size = float(np.median([np.linalg.norm(np.ptp(points, axis=0)) for points in scans]))
+    trees = [cKDTree(points) for points in scans]
+    sights = [cKDTree(points / np.linalg.norm(points, axis=1, keepdims=True)) for points in scans]
+    on, before = np.zeros((2, len(scans), len(scans)))
+    for v, w in pairs:
+        asked = frames.transform(frames.inverse(poses[w]) @ poses[v], scans[v][:: -(-len(scans[v]) // _ASKED)])
+        on[v, w] = (trees[w].query(asked)[0] < _NEAR * size).mean()
+        away = np.linalg.norm(asked, axis=1)
+        aside, seen = sights[w].query(asked / away[:, None])
+        nearer = np.linalg.norm(scans[w][seen], axis=1) - away > _BEFORE * size
+        before[v, w] = (nearer & (aside * away < _NEAR * size)).mean()
+    group = _linked(len(scans), [(v, w) for v, w in pairs if on[v, w] + on[w, v] >= 2 * _ON])
+    first, second = (group == k for k in np.argsort(-np.bincount(group, minlength=2))[:2])
+    if min(first.sum(), second.sum()) < _FEWEST_VIEWS:
+        return
+    between = [max(before[v, w], before[w, v]) for v, w in pairs if first[v] and second[w]]
+    within = [before[v, w] for v, w in pairs if group[v] == group[w]]
+    if between and np.median(between) >= _BETWEEN and np.median(within) <= _WITHIN:
+        names = [", ".join(clouds[rows[i]].name for i in np.flatnonzero(side).tolist()) for side in (first, second)]
+        told = f"{clouds[0].parent}: two parts, or one that changed its shape: {names[0]} lie on each other, so do "
+        told += (
+            f"{names[1]}; between the two groups {np.median(between):.0%} of the points lie before what the other saw"
+        )
+        raise Refusal(told, *_one_group_each(clouds, best.interpretation, rows, second))
+
+
+def require_no_change(
+    clouds: Sequence[Path], motions: RelativeScans, ways: Sequence[Interpretation], kept: Sequence[int]
+) -> None:
     """Refuse poses that fit in two groups and, with one change undone, as a whole; not as they stand.
 
     Args:
-        clouds: in the order of the views.
+        clouds: of the folder, in the order of their names.
+        kept: numbers of the views among them.
         motions: of the scans, mm.
         ways: to read the poses.
 
     Raises:
         InputError: names the views, the size of the change and what it leaves.
     """
-    count = len(clouds)
+    count = len(kept)
     tried = [way.hypothesis(i) for i, way in enumerate(ways) if len(way.pairing.used) == count]
     first = np.arange(count) < count // 2
     sides = (first, ~first, np.ones(count, bool))
@@ -66,7 +121,9 @@ def require_no_change(clouds: Sequence[Path], motions: RelativeScans, ways: Sequ
                 found.append((change[1].open, later, change, as_it_stands))
     if found:
         _, later, (step, undone), as_it_stands = min(found, key=lambda one: one[0])
-        raise Refusal(_change_message(clouds, later, step, undone, as_it_stands), *_one_group_each(later))
+        unit = ways[0].length_unit
+        told = _change_message([clouds[i] for i in kept], later, (step, unit), undone, as_it_stands)
+        raise Refusal(told, *_one_group_each(clouds, ways[0], kept, later))
 
 
 def _groups(fit: MotionFit, motions: RelativeScans) -> Iterator[Mask]:
@@ -82,18 +139,29 @@ def _groups(fit: MotionFit, motions: RelativeScans) -> Iterator[Mask]:
         closes = (rotation_angles(off) < ROTATION) & (np.linalg.norm(off[:, :3, 3], axis=1) < TRANSLATION_M / MM)
         closing = RelativeScans(tuple(p for p, c in zip(motions.pairs, closes, strict=True) if c), motions.T[closes])
         X = fit_motions(fit.hypothesis, closing, TRANSLATION_M / MM).T_mount
-    group = np.arange(count)
-    for a, b in zip(v[closes], w[closes], strict=True):
-        group[group == group[b]] = group[a]
+    group = _linked(count, zip(v[closes], w[closes], strict=True))
     largest = np.bincount(group).argmax()
     if _FEWEST_VIEWS <= (group != largest).sum() <= count - _FEWEST_VIEWS:
         yield group != largest
 
 
-def _one_group_each(later: Mask) -> list[Fix]:
+def _linked(count: int, links: Iterable[tuple[int, int]]) -> Indices:
+    """Return for each view the number of its group, of those that links join."""
+    group = np.arange(count)
+    for a, b in links:
+        group[group == group[b]] = group[a]
+    return np.unique(group, return_inverse=True)[1]
+
+
+def _one_group_each(clouds: Sequence[Path], way: Interpretation, kept: Sequence[int], later: Mask) -> list[Fix]:
     """Sessions of the views of either group."""
     words = ("make one session of the first scans", "another of the others")
-    rows = [",".join(str(i + 1) if kept else "-" for i, kept in enumerate(side)) for side in (~later, later)]
+    of_cloud = dict(zip(kept, zip(way.pairing.rows, later, strict=True), strict=True))
+    each = [of_cloud.get(i, (None, False)) for i in range(len(clouds))]
+    rows = [
+        ",".join(str(row + 1) if row is not None and late == side else "-" for row, late in each)
+        for side in (False, True)
+    ]
     return [
         Fix(f"{told}, --rows={row} -o {name}", {"rows": row, "output": name})
         for told, row, name in zip(words, rows, ("before", "after"), strict=True)
@@ -138,15 +206,17 @@ def _is_change(T: Array) -> bool:
 
 
 def _change_message(
-    clouds: Sequence[Path], later: Mask, change: Array, undone: MotionFit, as_it_stands: MotionFit
+    clouds: Sequence[Path], later: Mask, step: tuple[Array, str], undone: MotionFit, as_it_stands: MotionFit
 ) -> str:
-    shift = ", ".join(f"{x + 0.0:.1f}" for x in change[:3, 3])
+    change, unit = step
+    shift = ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in change[:3, 3].tolist())
     turn = np.degrees(np.linalg.norm(frames.log(change[None])[0, :3]))
     names = [cloud.name for cloud, is_later in zip(clouds, later, strict=True) if is_later]
     at_one = (np.diff(later.astype(int)) >= 0).all()
     told = f"a tool, the scanner, the part or the base changed at {names[0]}: the scans before it and those from it on"
     told = told if at_one else f"two lists of poses are mixed: {', '.join(names)} and the other scans"
+    told += f" fit each among themselves, by ({shift}) mm and {turn:.2f}° from another, with poses in {unit}"
     return (
-        f"{clouds[0].parent}: {told} fit each among themselves, by ({shift}) mm and {turn:.2f}° from another; with "
-        f"that undone {undone.closed:.0%} of the scanner's motions close, as it stands {as_it_stands.closed:.0%}"
+        f"{clouds[0].parent}: {told}; with that undone {undone.closed:.0%} of the scanner's motions close, as it "
+        f"stands {as_it_stands.closed:.0%}"
     )

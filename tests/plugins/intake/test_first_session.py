@@ -235,3 +235,28 @@ def test_profiles_of_a_sphere_become_a_session_for_its_calibration(tmp_path, cam
     first = first_session(tmp_path / "in", StatedFolder(targets=TargetSearch(balls=(25.0,))))
     write_draft(tmp_path / "made", first)
     assert load_session(tmp_path / "made").sphere_radius == 25.0
+
+
+@pytest.mark.parametrize("others", [slice(4, None), slice(1, None, 2)])
+def test_scans_of_two_parts_are_told_by_name_and_those_of_one_are_not(tmp_path, others):
+    """The second part is the first one sheared, scanned at right poses."""
+    measured = measured_blade(13, 8, "eye_in_hand", (0.0, 0.0), pixels=60)
+    write_session(tmp_path / "s", measured, "s")
+    session = load_session(tmp_path / "s")
+    poses = np.array([view.T_base_flange for view in session.views])
+    T = poses @ measured.T_mount
+    shear = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
+    parts = [frames.transform(pose, view.cloud.points) for pose, view in zip(T, session.views, strict=True)]
+    middle = np.vstack(parts).mean(axis=0)
+    for folder, sheared in (("one", []), ("two", np.arange(8)[others].tolist())):
+        (tmp_path / folder).mkdir()
+        for i, (pose, part) in enumerate(zip(T, parts, strict=True)):
+            part = (part - middle) @ shear.T + middle if i in sheared else part
+            np.save(tmp_path / folder / f"scan_{i}.npy", frames.transform(np.linalg.inv(pose), part))
+        np.savetxt(tmp_path / folder / "poses.txt", poses[:, :3].reshape(8, 12))
+    assert first_session(tmp_path / "one", StatedFolder()).choice.determined
+    with pytest.raises(InputError, match="two parts, or one that changed its shape") as refused:
+        first_session(tmp_path / "two", StatedFolder())
+    rows = {row for fix in refused.value.fixes for row in [fix.options["rows"]]}
+    second = ",".join(str(i + 1) if i in sheared else "-" for i in range(8))
+    assert second in rows and len(rows) == 2

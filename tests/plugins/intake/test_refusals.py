@@ -172,7 +172,7 @@ INPUTS = {
 # Functions that refuse and are not in the table: what needs scans that overlap, arms or files of size is provoked in
 # tests of its own and in the tables field-cases, drawn-folders and field-kinds.
 ELSEWHERE = {
-    "require_no_background", "require_own_frames", "require_scale", "require_no_change", "_require_fit",
+    "require_no_background", "require_own_frames", "require_scale", "require_no_change", "require_one_part", "_require_fit",
     "_require_determined", "rows_with_scans", "_without_folder", "_from_workbook", "header_poses", "_no_rows",
     "_require_one_decimal_mark", "_split_header", "_read_file", "_in_another_unit", "_read_clouds", "_require_folder",
     "_told_by_scans", "several_lists",

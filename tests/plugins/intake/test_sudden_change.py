@@ -1,5 +1,6 @@
 """A tool or a base that changed at one view is named with its size, where the poses fit with it undone."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,15 +36,27 @@ def campaign(tool=None, base=None, views=slice(5, None)):
     return RelativeScans(tuple(pairs), motions), ways
 
 
+def test_each_group_is_stated_with_its_rows_where_a_cloud_shows_nothing():
+    """The clouds are eleven, of which the first is empty, and the rows begin with its own."""
+    change = frames.make(np.eye(3), np.array([0.0, 0.0, 150.0]))
+    motions, ways = campaign(tool=change)
+    ways = [replace(way, pairing=Pairing(tuple(range(1, 11)), "", True)) for way in ways]
+    for way in ways:
+        object.__setattr__(way.reading, "T", np.concatenate([np.eye(4)[None], way.reading.T]))
+    with pytest.raises(InputError) as refused:
+        require_no_change([Path("cell/empty.ply"), *CLOUDS], motions, ways, range(1, 11))
+    assert [fix.options["rows"] for fix in refused.value.fixes] == ["-,2,3,4,5,6,-,-,-,-,-", "-,-,-,-,-,-,7,8,9,10,11"]
+
+
 def test_poses_without_a_change_are_let_through():
-    require_no_change(CLOUDS, *campaign())
+    require_no_change(CLOUDS, *campaign(), range(10))
 
 
 @pytest.mark.parametrize("side", ["tool", "base"])
 def test_a_change_is_named_with_its_view_and_its_size(side):
     change = frames.make(np.eye(3), np.array([0.0, 0.0, 150.0]))
     with pytest.raises(InputError, match="changed at scan_05.ply") as refused:
-        require_no_change(CLOUDS, *campaign(**{side: change}))
+        require_no_change(CLOUDS, *campaign(**{side: change}), range(10))
     assert "150.0) mm and 0.00°" in str(refused.value) and "100% of the scanner's motions close" in str(refused.value)
 
 
@@ -53,7 +66,7 @@ def test_a_change_is_named_with_its_view_and_its_size(side):
 def test_two_lists_in_one_table_are_named_with_their_views(side, views):
     change = frames.make(np.eye(3), np.array([0.0, 30.0, 150.0]))
     with pytest.raises(InputError, match="two lists of poses are mixed") as refused:
-        require_no_change(CLOUDS, *campaign(**{side: change}, views=views))
+        require_no_change(CLOUDS, *campaign(**{side: change}, views=views), range(10))
     named = {cloud.name for cloud in CLOUDS if cloud.name in str(refused.value)}
     changed = {CLOUDS[i].name for i in np.arange(10)[views]}
     assert named in (changed, {cloud.name for cloud in CLOUDS} - changed)
