@@ -31,6 +31,7 @@ SAYS = {
     "joint_thermal": ("joint", "slow"),
     "joint_step": ("joint", "view"),
     "robot_thermal_growth": ("link", "slow"),
+    "link_thermal": ("link", "slow"),
     "mount_drift": ("scanner", "slow"),
     "mount_warmup": ("scanner", "slow"),
     "mount_creep": ("scanner", "slow"),

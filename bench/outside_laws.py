@@ -184,7 +184,7 @@ NAMES = {
     "play in a gear": ("backlash",),
     "poses read late in motion": ("latency",),
     "coupling creeps in behind a move": ("settling",),
-    "one link grows warm": ("robot_thermal_growth",),
+    "one link grows warm": ("robot_thermal_growth", "link_thermal"),
     "adapter droops at the flange": ("mount_droop", "mount_bend", "fixture_droop", "fixture_bend"),
     "scanner is knocked": ("mount_step",),
     "field of the scanner is a bowl": ("field_curvature",),

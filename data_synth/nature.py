@@ -57,6 +57,7 @@ LAWS: dict[str, Law] = {
     "fixture_droop": Law("part", brackets.draw, brackets.fixture_droop),
     "base_compliance": Law("base", bodies.draw_base, bodies.base_compliance),
     "joint_thermal": Law("joints", joints.draw_thermal, joints.joint_thermal),
+    "link_thermal": Law("arm", joints.draw_warm_link, joints.link_thermal),
     "joint_step": Law("joints", joints.draw_step, joints.joint_step),
     "mount_creep": Law("mount", bodies.draw_creep, bodies.mount_creep),
     "mount_step": Law("mount", bodies.draw_slip(4e-4, 0.1), bodies.mount_step),

@@ -54,6 +54,12 @@ def draw_thermal(amplitude: float, plan: Plan, rng: np.random.Generator) -> Para
     return {**draw_one("k", 6e-5, sign=True)(amplitude, plan, rng), "T": 0.0}
 
 
+def draw_warm_link(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """One of the long links ahead of the wrist, which follows the same."""
+    long = [j for j in plan.useful if np.hypot(plan.arm.a[j], plan.arm.d[j]) > 100 and j + 1 < plan.arm.joints]
+    return {f"g{int(rng.choice(long)) + 1}": 4e-5 * amplitude, "T": 0.0}
+
+
 def draw_step(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
     """One joint that loses counts in the middle third of the session."""
     views = len(plan.joints)
@@ -118,6 +124,13 @@ def link_geometry(p: Parameters, moment: Moment, arm: Arm) -> Arm:
     """DH rows off by da, dd, dalpha."""
     n = arm.joints
     return replace(arm, a=arm.a + _of(p, "da", n), d=arm.d + _of(p, "dd", n), alpha=arm.alpha + _of(p, "dalpha", n))
+
+
+def link_thermal(p: Parameters, moment: Moment, arm: Arm) -> Arm:
+    """The lengths of one link × (1 + g ΔT) since the first view."""
+    warmer = moment.covariates["robot_temperature_c"] - moment.start["robot_temperature_c"]
+    factor = 1 + _of(p, "g", arm.joints) * warmer
+    return replace(arm, a=arm.a * factor, d=arm.d * factor)
 
 
 def robot_thermal_growth(p: Parameters, moment: Moment, arm: Arm) -> Arm:

@@ -43,6 +43,7 @@ ARTEFACTS = {
     "mount_step": "repeat the first view now",
     "base_compliance": "repeat three views with another payload, the arm stretched out ahead and to either side",
     "joint_thermal": "repeat the first views once that temperature has changed",
+    "link_thermal": "repeat the first views once that temperature has changed",
     "joint_step": "repeat the first view now, and one with the joint turned far away",
     "joint_compliance": "repeat three views with another payload",
     "backlash": "repeat three views approached from the other side of every joint",

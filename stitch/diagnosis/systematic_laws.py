@@ -3,8 +3,8 @@
 A name is worth no more than what it is compared with, and a library is a poor rival of itself. So an effect is held
 against all that views may follow: every column of views.csv, time or view order, angle, last move and torque of every
 joint, its approach, a step from some view on. Each may move what the reference carries (the part, and the base of an
-arm whose base is the reference), what stands at the far end of the arm, or any one joint; as a line or smoothly; in all
-six numbers, or along or about one axis.
+arm whose base is the reference), what stands at the far end of the arm, any one joint, or the length of one link, which
+follows no angle; as a line or smoothly; in all six numbers, or along or about one axis.
 
 A place and what it follows are one law, each as likely before as any other; its forms share that. All forms are sized
 at the variances of the model, the likeliest few with all variances anew (`score.try_form`), as effects are.
@@ -25,7 +25,7 @@ from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, try_form
-from stitch.effects.contract import EFFECTS, Effect, Parameter
+from stitch.effects.contract import EFFECTS, Effect, Parameter, per_joint
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import Term, term_of
 from stitch.numerics import frames
@@ -36,6 +36,7 @@ from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel, Observation
 from stitch.observations.pose_errors import usual_twist
 from stitch.session.measurement import Views
+from stitch.session.robot import Links
 
 TIME = "time_s"
 # What views follow in their order: a step from some view on, or where no time is stated a trend.
@@ -56,10 +57,20 @@ _HELD = 60e6
 _STILL = np.radians(2.0)
 # What is usual of a joint (rad); of a flange `usual_twist` says it.
 _JOINT = 4e-4
+# The same of a link's lengths: steel by 17 °C.
+_GROWN = 2e-4
 # Draws of what chance makes of the clearest law, their seed; by-count chances beyond which none is clear, and numbers
 # among which there is no time to draw.
 _DRAWS, _SEED = 499, 20
 _DRAWN_UP_TO, _MOST_DRAWN = 1.0, 400
+
+
+def _grow(links: Links, views: Views, g: Array) -> Links:
+    """DH lengths of row i ×(1+g_i)"""
+    return replace(links, lengths=links.lengths * (1 + g))
+
+
+_LENGTHS = Effect("lengths", "links", {"g": per_joint("1", _GROWN, 1.0)}, _grow, needs=(), prefers=(), tier="empirical")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +82,20 @@ class Driver:
     values: Array  # (V,)
     shapes: dict[str, Array]  # in words: (V, R), nought where the law is none yet, 1 at the most
     joint: int | None = None  # the one that alone may follow it, counted from 1
+    of_arm: bool = False  # angles, moves and torques, which the lengths of links do not follow
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
     """Where a law acts."""
 
-    name: str  # joint 3, or all that moves alike: the part or the base
+    name: str  # joint 3, link 2, or all that moves alike: the part or the base
     twists: Array  # (V, 6, k) of the views about the observation's centre, per rad and length_unit
     sizes: Array  # (k,) that are usual
     whole: Indices  # all that is independent of these; the others are further axes
     units: tuple[str, ...]  # rad, or length_unit
     joint: int | None = None  # counted from 1
-    kind: str = "robot"  # place of effects that act there: robot, part, mount
+    kind: str = "robot"  # place of effects that act there: robot, links, part, mount
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +138,7 @@ class Law:
     def words(self) -> str:
         """Joint 3 follows ambient_c (a line); the part sits displaced from view v010 on."""
         if self.driver.name == STEP:
-            verb = "is off" if self.place.joint else "sits displaced"
+            verb = "is off" if self.place.kind in ("robot", "links") else "sits displaced"
             return f"{self.place.name} {verb} from {self.shape.removeprefix('a step at ')} on"
         return f"{self.place.name} follows {self.driver.name} ({self.shape})"
 
@@ -208,7 +220,7 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
     effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
     for place in _places(linear):
         for driver in drivers:
-            if driver.joint not in (None, place.joint):
+            if driver.joint not in (None, place.joint) or (driver.of_arm and place.kind == "links"):
                 continue
             forms = list(_forms(place, driver))
             laws += [law for law, _ in forms]
@@ -399,12 +411,15 @@ def _places(linear: LinearModel) -> Iterator[Place]:
         about = np.concatenate([axes, np.zeros_like(axes)], axis=1) if kind == "mount" else about_centre
         yield Place(name, np.concatenate([moved, about], axis=2), sizes, np.arange(6), units, kind=kind)
     if measurement.views.joints.shape[1] and measurement.robot is not None:
-        offset = term_of(measurement, EFFECTS["joint_offset"])
-        motions = next(pose_derivatives(measurement, linear.model, [offset], centre))
-        for k, moved in enumerate(motions):
-            end = {0: " or the base", len(motions) - 1: " or what the flange carries"}.get(k, "")
-            size = np.array([_JOINT])
-            yield Place(f"joint {k + 1}{end}", moved[..., None], size, np.arange(1), ("rad",), k + 1)
+        terms = [term_of(measurement, effect) for effect in (EFFECTS["joint_offset"], _LENGTHS)]
+        of_joints, of_links = pose_derivatives(measurement, linear.model, terms, centre)
+        ends = {0: " or the base", len(of_joints) - 1: " or what the flange carries"}
+        for k, (turned, grown) in enumerate(zip(of_joints, of_links, strict=True)):
+            end = ends.get(k, "")
+            yield Place(f"joint {k + 1}{end}", turned[..., None], np.array([_JOINT]), np.arange(1), ("rad",), k + 1)
+            if np.abs(grown).max() * _GROWN > usual[-1] / 10:
+                size = np.array([_GROWN])
+                yield Place(f"link {k + 1}{end}", grown[..., None], size, np.arange(1), ("1",), kind="links")
 
 
 def drivers_of(views: Views) -> Iterator[Driver]:
@@ -425,7 +440,7 @@ def drivers_of(views: Views) -> Iterator[Driver]:
             continue
         waves = [np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for n in (1, 2, 3, 4)]
         turns = {"a wave, once a turn": waves[0], "a wave, twice a turn": waves[1]}
-        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns)
+        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, of_arm=True)
         # Errors of a gear of one and two periods a turn have a name; those of three and four have not.
         teeth = {"a wave, three times a turn": waves[2], "a wave, four times a turn": waves[3]}
         yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), teeth, k + 1)
@@ -439,7 +454,8 @@ def drivers_of(views: Views) -> Iterator[Driver]:
 def _lines(name: str, unit: str, values: Array) -> Iterator[Driver]:
     """Give what is followed in proportion, if it changes."""
     if np.ptp(values) > _SAME_VALUE * max(np.abs(values).max(), 1.0):
-        yield Driver(name, unit, values, {"in proportion": (values / np.abs(values).max())[:, None]})
+        shapes = {"in proportion": (values / np.abs(values).max())[:, None]}
+        yield Driver(name, unit, values, shapes, of_arm=True)
 
 
 def _smooth(values: Array) -> dict[str, Array]:
@@ -460,6 +476,9 @@ def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
         if place.joint is not None:
             yield Law(place, driver, shape, place.whole), shares / 2
             yield Law(place, driver, shape, place.whole, centred=True), shares / 2
+            continue
+        if place.kind == "links":
+            yield Law(place, driver, shape, place.whole), shares
             continue
         yield Law(place, driver, shape, place.whole), shares / 2
         axes = place.twists.shape[2]
@@ -502,10 +521,11 @@ def _says(
         follows.add(TIME)
     event = any(p.discrete for p in candidate.parameters)
     declared = driver.name in follows or (driver.name == STEP and event)
-    if place.joint is None and declared:
+    whole_body = place.joint is None and place.kind != "links"
+    if whole_body and declared:
         return True
     if (driver.name == STEP) != event:
         return False
-    if place.joint is None:
+    if whole_body:
         return any(law.contains(form) for law in laws for form in whole)
     return any(form.contains(law) for law in laws for form in whole)

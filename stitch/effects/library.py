@@ -113,6 +113,12 @@ def joint_step(joints: Array, views: Views, d: Array, v: float) -> Array:
     return joints + np.outer(views.number >= v, d)
 
 
+@effect("links", needs=("joints", "temperature"), prior=_RARE, g=per_joint("1/°C", 2e-5, 2e-4), T=temperature())
+def link_thermal(links: Links, views: Views, g: Array, T: float) -> Links:
+    """DH lengths of row i ×(1+g_i·(T−T₀)), T one of the temperatures that were measured"""
+    return replace(links, lengths=links.lengths * (1 + np.outer(views.since_first(TEMPERATURES[round(T)]), g)))
+
+
 @effect("links", needs=("joints",), prefers=("robot_temperature_c",), g=number("1/°C", typical=2e-5, limit=2e-4))
 def robot_thermal_growth(links: Links, views: Views, g: float) -> Links:
     """DH lengths ×(1+g·ΔT), ΔT from robot_temperature_c; without it g per hour"""

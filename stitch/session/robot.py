@@ -163,12 +163,13 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
 
 @dataclass(frozen=True)
 class Links:
-    """What is wrong with an arm's links: a factor on all lengths per view, and errors of the DH rows.
+    """What is wrong with an arm's links: factors on all lengths and on those of each link, and errors of the DH rows.
 
     For URDF the errors act behind the joint in the frame that its axis makes: along x, along z, about x.
     """
 
     scale: Array  # (V,)
+    lengths: Array  # (V, n)
     da: Array  # (n,) length_unit
     dd: Array  # (n,) length_unit
     dalpha: Array  # (n,) rad
@@ -180,6 +181,7 @@ class FlangeSlopes:
 
     joints: Array  # (V, 6, n)
     scale: Array  # (V, 6)
+    lengths: Array  # (V, 6, n)
     da: Array  # (V, 6, n)
     dd: Array  # (V, 6, n)
     dalpha: Array  # (V, 6, n)
@@ -188,12 +190,13 @@ class FlangeSlopes:
         """Return (V, 6) twists of the flange for small changes of the joint angles (V, n) and of the links."""
         rows = np.einsum("vki,i->vk", self.da, links.da) + np.einsum("vki,i->vk", self.dd, links.dd)
         rows += np.einsum("vki,i->vk", self.dalpha, links.dalpha)
+        rows += np.einsum("vki,vi->vk", self.lengths, links.lengths)
         return np.einsum("vki,vi->vk", self.joints, joints) + self.scale * links.scale[:, None] + rows
 
 
 def exact_links(count: int, joints: int) -> Links:
     """Return the links of an arm without any error, for `count` views."""
-    return Links(np.ones(count), *np.zeros((3, joints)))
+    return Links(np.ones(count), np.ones((count, joints)), *np.zeros((3, joints)))
 
 
 def forward_with_errors(robot: Robot, joints: Array, links: Links) -> Array:
@@ -211,16 +214,18 @@ def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
     modified = robot.convention == "modified"
     still = np.zeros((len(joints), 3))
     scale = np.zeros((len(joints), 6))
-    reach = links.scale[:, None]
-    slopes = dict[str, list[Array]](joints=[], da=[], dd=[], dalpha=[])
-    for before, turned, after, moved in chain:
+    slopes = dict[str, list[Array]](joints=[], lengths=[], da=[], dd=[], dalpha=[])
+    for (before, turned, after, moved), factor in zip(chain, links.lengths.T, strict=True):
+        reach = (links.scale * factor)[:, None]
         row = before if modified else after  # the frame at whose x axis da and dalpha act
         slopes["joints"].append(_screw(T, turned, turned[..., :3, _Z], still))
         slopes["da"].append(_screw(T, row, still, reach * row[..., :3, _X]))
         slopes["dalpha"].append(_screw(T, row, row[..., :3, _X], still))
         # d lies along the joint's own axis: ahead of `after`, or, modified, at its end.
         slopes["dd"].append(_screw(T, after, still, reach * (after if modified else turned)[..., :3, _Z]))
-        scale += _screw(T, after, still, moved / reach)
+        longer = _screw(T, after, still, moved)
+        scale += longer / links.scale[:, None]
+        slopes["lengths"].append(longer / factor[:, None])
     return FlangeSlopes(scale=scale, **{name: np.stack(by_joint, axis=-1) for name, by_joint in slopes.items()})
 
 
@@ -235,9 +240,10 @@ def _chain(robot: Robot, joints: Array, links: Links) -> list[tuple[Array, Array
         before, after = robot.before[i], z_error[i] @ robot.after[i] @ x_error[i]
         if robot.convention == "modified":
             before, after = robot.before[i] @ x_error[i], robot.after[i] @ z_error[i]
-        first = T @ _scaled(before, links.scale)
+        scale = links.scale * links.lengths[:, i]
+        first = T @ _scaled(before, scale)
         turned = first @ elementary("z", joints[:, i] + robot.theta[i])
-        last = turned @ _scaled(after, links.scale)
+        last = turned @ _scaled(after, scale)
         moved = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
         chain.append((first, turned, last, moved))
         T = last

@@ -107,8 +107,8 @@ def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
         arm = replace(
             arm, a=arm.a + number(p, "da", n), d=arm.d + number(p, "dd", n), alpha=arm.alpha + number(p, "dalpha", n)
         )
-    elif name == "robot_thermal_growth":
-        growth = 1 + p["g"] * warmer["robot_temperature_c"]
+    elif name in ("robot_thermal_growth", "link_thermal"):
+        growth = 1 + (p.get("g") or number(p, "g", n)) * warmer["robot_temperature_c"]
         arm = replace(arm, a=arm.a * growth, d=arm.d * growth)
     # mount
     mount = measured.T_mount

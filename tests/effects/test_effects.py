@@ -44,7 +44,7 @@ def hidden(name, mount):
 RIGID = [
     "mount_drift", "mount_warmup", "joint_offset", "link_geometry", "joint_compliance", "gear_eccentricity",
     "gear_harmonic", "backlash", "settling", "robot_thermal_growth", "base_compliance", "joint_thermal", "joint_step",
-    "mount_creep", "mount_step",
+    "mount_creep", "mount_step", "link_thermal",
 ]  # fmt: skip
 
 
