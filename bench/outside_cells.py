@@ -80,9 +80,10 @@ def trial(job: Row) -> Row:
         except (stitch.InputError, stitch.NoResultError) as error:
             return row | {"refused": str(error)}
     found = diagnosis.to_dict()
-    keys = ("verdict", "effects", "plain", "sentence", "laws", "joint_laws", "time_law", "doubts", "together")
+    keys = ("verdict", "effects", "plain", "sentence", "laws", "joint_laws", "time_law", "places", "doubts", "together")
     row |= {key: found.get(key) for key in keys} | {"said": lines, "last": last.verdict, "certain": diagnosis.certain}
     row["sizes"] = {c["effect"]: c["parameters"] for c in found["candidates"] if c["effect"] in found["effects"]}
+    row["unseen"] = [c["effect"] for c in found["candidates"] if c["effect"] in diagnosis.sentence]
     row["depends"] = [[d["covariate"], d.get("place"), d["p_value"]] for d in found["depends_on"][:3]]
     before, after = run.to_dict(), (better or run).to_dict()
     row |= {"added": sorted(after["effects"]), "rms": [before["residual_rms"], after["residual_rms"]]}
@@ -124,8 +125,14 @@ def grade(row: Row, name: str) -> str:
 
 
 def law_told(row: Row) -> str:
-    """Return what the told laws are worth: right, place (what it follows is not), wrong, or "" where none is told."""
-    grades = {_law_grade(row, told["place"], told["follows"]) for told in row["laws"]}
+    """Return what the told laws are worth: right, place (what it follows is not), wrong, or "" where none is told.
+
+    Where no law is told, a place may be, or the joint that errs along a curve without a name.
+    """
+    told = [(law["place"], law["follows"]) for law in row["laws"]]
+    told = told or [(place, "") for place in row.get("places", [])]
+    told = told or [(f"joint {curve['joint']}", "") for curve in row["joint_laws"]]
+    grades = {_law_grade(row, place, follows) for place, follows in told}
     return next((word for word in ("right", "place", "wrong") if word in grades), "")
 
 
@@ -200,10 +207,16 @@ def _shares(rows: list[Row]) -> Iterator[str]:
 
 def _fits(rows: list[Row]) -> Iterator[str]:
     done = [row for row in rows if "refused" not in row]
-    yield share(row["verdict"] == "adequate" and row["visible"] ** 2 > 3 * row["scatter"] ** 2 for row in done)
+    yield share(_silent(row) for row in done)
     yield share(_worse(row) for row in done if row["added"])
     yield share(_largest(row["before"]) < 3 for row in done)
     yield share(_largest(_after(row)) < 3 for row in done)
+
+
+def _silent(row: Row) -> bool:
+    """Return whether a law beyond twice the expected scatter ends in "adequate" and not as one that cannot show."""
+    unseen = set(NAMES.get(row["law"], ())) & set(row.get("unseen", ()))
+    return bool(row["verdict"] == "adequate" and row["visible"] ** 2 > 3 * row["scatter"] ** 2 and not unseen)
 
 
 def _after(row: Row) -> list[list[float]]:

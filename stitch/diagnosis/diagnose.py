@@ -19,6 +19,7 @@ from stitch.diagnosis.sensitivity import (
     detectable_sizes,
     hand_eye_response,
     omitted_effect_bias,
+    unseen_shape_error,
 )
 from stitch.diagnosis.sentences import diagnosis_sentence
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
@@ -103,6 +104,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         doubts=state.doubts,
         laws=evidence.told_laws,
         rival_trend=evidence.rival_trend if evidence.named else "",
+        places=evidence.told_places,
         beyond_belief=too_large(evidence.named),
         together=_named_together(evidence),
         tried=state.tried,
@@ -133,6 +135,7 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
             cross_validation=validation,
             detectable=detectable,
             hand_eye=omitted_effect_bias(linear, response, scored.candidate, detectable),
+            shape=unseen_shape_error(linear, scored.candidate, detectable),
         )
 
     return list(parallel(examined, range(len(scores)), "candidate effects on views left out"))

@@ -46,6 +46,7 @@ class CandidateEffect:
     cross_validation: CrossValidation | None
     detectable: dict[str, float]  # smallest detectable size per parameter, alone
     hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`omitted_effect_bias`)
+    shape: float | None  # by how much it would bend the scans unseen, rms, length_unit (`unseen_shape_error`)
 
     @property
     def name(self) -> str:
@@ -106,6 +107,7 @@ class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_docu
     coincidence: str = ""  # of `Evidence`
     laws: tuple[Ranked, ...] = ()  # of the dictionary: rivals of what is named, or what is found where nothing is
     rival_trend: str = ""  # of `Evidence`
+    places: tuple[str, ...] = ()  # where something acts that follows too many laws alike to tell any
     beyond_belief: tuple[str, ...] = ()  # parameters of what is named that are larger than is believed of them
     together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why

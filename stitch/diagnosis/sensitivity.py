@@ -1,7 +1,8 @@
 """What these views can show of an effect: what could do the same, the smallest size that shows, what it does unseen.
 
 Candidates are aliases where what they do correlates, hand-eye and model projected out (`alias_matrix`). An effect that
-is too small to be seen would push the hand-eye by what its sigma does not hold (`omitted_effect_bias`).
+is too small to be seen would push the hand-eye by what its sigma does not hold (`omitted_effect_bias`), and bend the
+scanned surface by what all scans share of it (`unseen_shape_error`).
 
 The smallest size that shows is the one at which both tests in use pass with 80 % probability. An effect of true
 parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The scatter is known to ν
@@ -19,10 +20,15 @@ from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, form_weights
+from stitch.model.forward import PointSlopes, moves_points
 from stitch.numerics import frames
 from stitch.numerics.distributions import f_limit, noncentral_f_tail
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel
+
+# Views and points of each that show how an effect bends the scans (time).
+_SHAPE_VIEWS, _SHAPE_POINTS = 5, 300
 
 
 def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
@@ -96,6 +102,34 @@ def omitted_effect_bias(
             if np.isfinite(detectable.get(p.name, np.inf)):
                 displacements.append(min(detectable[p.name], p.typical) * float(np.linalg.norm(moved)))
     return max(displacements, default=None)
+
+
+def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: dict[str, float]) -> float | None:
+    """Return the largest rms (length_unit), along normals, by which a size that does not show bends the scans.
+
+    Scans that err alike agree, and their error becomes the surface. What a motion of each view does too is no shape.
+    None for effects of poses, and without scans.
+    """
+    measurement = linear.measurement
+    term = candidate.forms[0].term
+    if candidate.empirical or not moves_points([term]) or not measurement.capture.scans:
+        return None
+    slopes = PointSlopes(measurement, [term], linear.model)
+    poses = measurement.capture.poses(linear.model.T_mount)
+    squares = []
+    for v in _spread(len(poses), _SHAPE_VIEWS):
+        scan = measurement.capture.scans[v]
+        index = _spread(len(scan.points), _SHAPE_POINTS)
+        points, normals = scan.points[index], scan.normals[index]
+        along = np.einsum("pni,ni->np", slopes.at(v, poses[v], index), normals)
+        moves = column_space(np.hstack([np.cross(points, normals), normals]))
+        squares.append(np.mean((along - moves @ (moves.T @ along)) ** 2, axis=0))
+    sizes = [size if np.isfinite(size := detectable.get(p.name, np.inf)) else p.typical for p in term.parameters]
+    return float(np.max(np.sqrt(np.mean(squares, axis=0)) * sizes))
+
+
+def _spread(count: int, most: int) -> Indices:
+    return np.unique(np.linspace(0, count - 1, most).astype(int))
 
 
 def least_noncentrality(

@@ -18,6 +18,8 @@ from stitch.observations.surfaces.field_error import FieldError
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.
 _MAX_CURVES = 2
+# Share of the expected scatter beyond which an error of the surface that does not show is told (custom).
+_LEAST_SHAPE = 0.5
 _CAUSES = (
     "Possible causes: a part that bends, an arm still settling during the scan, a scanner that warms up or errs by "
     "range or brightness."
@@ -51,6 +53,11 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     if d.scanner_error is not None:
         calibration = "" if d.scanner_error.by_view else ", but a calibration may"
         yield f"{scanner_error_sentence(d.scanner_error, length_unit)} No pose corrects that{calibration}."
+    largest, name = max(((c.shape or 0.0, c.name) for c in d.candidates), default=(0.0, ""))
+    if largest > _LEAST_SHAPE * d.expected_scatter.translation:
+        size = length_text(largest, length_unit, 2)
+        yield "What all scans share becomes the surface, and no overlap shows it."
+        yield f"Unseen, {name} could bend the surface by {size} rms: a part of known shape shows that."
     yield from _not_named(d)
 
 
@@ -128,6 +135,8 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
     clear = [x.covariate for x in d.depends_on if x.p_value < CLEAR_DEPENDENCE][:3]
     if clear and not d.laws:
         yield f"What is left follows {_listed(clear, 'and')}."
+    if d.places:
+        yield f"Whatever it follows, it acts at {_listed(d.places, 'or')}: laws elsewhere are less likely by 20 to 1."
     yield from _poses_of_unknown(d, length_unit)
     yield from _not_named(d)
     untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]

@@ -2,9 +2,10 @@
 
 A name is worth no more than what it is compared with, and a library is a poor rival of itself. So an effect is held
 against all that views may follow: every column of views.csv, time or view order, angle, last move and torque of every
-joint, its approach, a step from some view on. Each may move what the reference carries (the part, and the base of an
-arm whose base is the reference), what stands at the far end of the arm, any one joint, or the length of one link, which
-follows no angle; as a line or smoothly; in all six numbers, or along or about one axis.
+joint, its approach, a step from some view on or as gravity falls to the other side of what hangs at the flange. Each
+may move what the reference carries (the part, and the base of an arm whose base is the reference), what stands at the
+far end of the arm, any one joint, or the length of one link, which follows no angle; as a line or smoothly; in all six
+numbers, as a turn or a shift, or along or about one axis.
 
 A place and what it follows are one law, each as likely before as any other; its forms share that. All forms are sized
 at the variances of the model, the likeliest few with all variances anew (`score.try_form`), as effects are.
@@ -31,7 +32,7 @@ from stitch.model.model import Term, term_of
 from stitch.numerics import frames
 from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.distributions import f_limits
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel, Observation
 from stitch.observations.pose_errors import usual_twist
@@ -42,17 +43,27 @@ TIME = "time_s"
 # What views follow in their order: a step from some view on, or where no time is stated a trend.
 STEP = "view order"
 NUMBER = "view number"
+# To which side of what it holds it falls.
+GRAVITY = "gravity"
 # Degree of a smooth function of a covariate; each power usually half as large as the one before.
 _DEGREE = 3
 # Views at an end that make a step; steps that are tried at the most, and laws and forms whose variances are fitted anew
 # (time).
 _VIEWS_AT_END, _MOST_STEPS = 2, 50
 _LAWS_FITTED, _FORMS_FITTED = 6, 12
+# Nats by which places may come nearer to the likeliest once variances are fitted anew.
+_NEAR_BEFORE = 2.0
 # Two columns of which this share is common are one.
 _SAME = 0.999
 _SAME_VALUE = 1e-9
 # Bytes of columns that are held from one question to the next.
 _HELD = 60e6
+# Directions of the flange to whose other side gravity may drop what hangs there with play.
+_ACROSS = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
+_FALLS = ("along x", "between x and y", "along y", "between y and -x", "along z")
+# What friction holds of the weight, steel on steel.
+_FRICTION = 0.2
+_NOT_LINKS = ("part", "mount", "robot")
 # A joint that turns less (rad) follows nothing of its own angle.
 _STILL = np.radians(2.0)
 # What is usual of a joint (rad); of a flange `usual_twist` says it.
@@ -82,7 +93,7 @@ class Driver:
     values: Array  # (V,)
     shapes: dict[str, Array]  # in words: (V, R), nought where the law is none yet, 1 at the most
     joint: int | None = None  # the one that alone may follow it, counted from 1
-    of_arm: bool = False  # angles, moves and torques, which the lengths of links do not follow
+    kinds: tuple[str, ...] = ("part", "mount", "robot", "links")  # of places that may
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +219,7 @@ class Dictionary:
             for r in rivals
             if law_of(r).place.joint is not None
             or law_of(r).place.kind != place
+            or law_of(r).driver.name == GRAVITY
             or not explained.contains(Span(linear.residual(r.score.form.columns)))
         )
 
@@ -220,7 +232,7 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
     effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
     for place in _places(linear):
         for driver in drivers:
-            if driver.joint not in (None, place.joint) or (driver.of_arm and place.kind == "links"):
+            if driver.joint not in (None, place.joint) or place.kind not in driver.kinds:
                 continue
             forms = list(_forms(place, driver))
             laws += [law for law, _ in forms]
@@ -250,7 +262,13 @@ def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]
     by_key: dict[tuple[str, str], list[int]] = {key: [] for key in dictionary.keys}
     for i, law in enumerate(laws):
         by_key[law.key].append(i)
-    likeliest = sorted(by_key, key=lambda key: -logsumexp(weighted[by_key[key]]))[:_LAWS_FITTED]
+    order = sorted(by_key, key=lambda key: -logsumexp(weighted[by_key[key]]))
+    likeliest = order[:_LAWS_FITTED]
+    if weighted.max() > limits.LOG_BAYES_FACTOR:
+        # Where it acts is told too: of every place that may be the one, its likeliest.
+        of_places = {place: key for key in reversed(order) for place in key[:1]}
+        near = weighted.max() - limits.ODDS - _NEAR_BEFORE
+        likeliest += [key for key in of_places.values() if key not in likeliest and weighted[by_key[key]].max() > near]
     prior = float(np.log(limits.PRIOR_LAWS / len(by_key)))
     ranked = list[Ranked]()
     for key in likeliest:
@@ -440,7 +458,7 @@ def drivers_of(views: Views) -> Iterator[Driver]:
             continue
         waves = [np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for n in (1, 2, 3, 4)]
         turns = {"a wave, once a turn": waves[0], "a wave, twice a turn": waves[1]}
-        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, of_arm=True)
+        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, kinds=_NOT_LINKS)
         # Errors of a gear of one and two periods a turn have a name; those of three and four have not.
         teeth = {"a wave, three times a turn": waves[2], "a wave, four times a turn": waves[3]}
         yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), teeth, k + 1)
@@ -449,13 +467,32 @@ def drivers_of(views: Views) -> Iterator[Driver]:
         yield from _lines(f"j{k + 1}_approach", "", views.approach[:, k].astype(float))
     for name, torque in zip(views.torques.names, views.torques.values.T, strict=True):
         yield from _lines(f"j{name}_torque_nm", "N m", torque)
+    for kind, gravity in (("mount", views.gravity_at_mount), ("part", views.gravity_at_part)):
+        if gravity is None or np.ptp(gravity, axis=0).max() < _SAME_VALUE:
+            continue
+        falls = {
+            f"a step as it falls {words}{held}": side[:, None].astype(float)
+            for held, friction in (("", 0.0), (", held by friction", _FRICTION))
+            for words, side in zip(_FALLS, _fallen(gravity @ _ACROSS.T, friction).T, strict=True)
+            if _VIEWS_AT_END <= side.sum() <= views.count - _VIEWS_AT_END
+        }
+        if falls:
+            yield Driver(GRAVITY, "g", gravity[:, 1], falls, kinds=(kind,))
+
+
+def _fallen(along: Array, friction: float) -> Mask:
+    """Return (V, k) to which side gravity (V, k) pulled last by more than friction holds."""
+    pulled = np.abs(along) > friction
+    pulled[0] = True
+    last = np.maximum.accumulate(np.where(pulled, np.arange(len(along))[:, None], 0), axis=0)
+    return np.take_along_axis(along, last, axis=0) > 0
 
 
 def _lines(name: str, unit: str, values: Array) -> Iterator[Driver]:
     """Give what is followed in proportion, if it changes."""
     if np.ptp(values) > _SAME_VALUE * max(np.abs(values).max(), 1.0):
         shapes = {"in proportion": (values / np.abs(values).max())[:, None]}
-        yield Driver(name, unit, values, shapes, of_arm=True)
+        yield Driver(name, unit, values, shapes, kinds=_NOT_LINKS)
 
 
 def _smooth(values: Array) -> dict[str, Array]:
@@ -480,10 +517,9 @@ def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
         if place.kind == "links":
             yield Law(place, driver, shape, place.whole), shares
             continue
-        yield Law(place, driver, shape, place.whole), shares / 2
-        axes = place.twists.shape[2]
-        for k in range(axes):
-            yield Law(place, driver, shape, np.array([k])), shares / 2 / axes
+        axes = np.arange(place.twists.shape[2])
+        for columns in (place.whole, *axes.reshape(-1, 3), *axes.reshape(-1, 1)):
+            yield Law(place, driver, shape, columns), shares / 3 / (len(axes) // len(columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,6 +535,8 @@ class Span:
 
     def contains(self, other: "Span") -> bool:
         """Return whether the other's columns are combinations of these."""
+        if not self.columns.any():
+            return False
         left = other.columns - self.basis @ (self.basis.T @ other.columns)
         return bool(other.columns.any() and np.sum(left**2) < (1 - _SAME) * np.sum(other.columns**2))
 

@@ -10,6 +10,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.ranking import Ranked, stands_out
+from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.diagnosis.validation import CrossValidation
 from stitch.observations.linear_model import LinearModel
@@ -91,6 +92,15 @@ class Evidence:
         least = self.laws[0].log_posterior - limits.ODDS
         near = tuple(r for r in self.laws if r.log_posterior > least)
         return near if len(near) <= limits.MOST_LAWS else ()
+
+    @property
+    def told_places(self) -> tuple[str, ...]:
+        """Where something acts that too many laws describe alike to tell any: all places within 20 to 1, if few."""
+        if self.verdict != "unknown_effect" or self.told_laws or not self.laws or not stands_out(self.laws[0]):
+            return ()
+        least = self.laws[0].log_posterior - limits.ODDS
+        places = dict.fromkeys(law_of(r).place.name for r in self.laws if r.log_posterior > least)
+        return tuple(places) if len(places) <= limits.MOST_LAWS else ()
 
     @property
     def named(self) -> tuple[Ranked, ...]:

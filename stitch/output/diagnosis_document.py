@@ -84,6 +84,7 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
         "minimum_detectable_of": clearest,
         "minimum_detectable_each": detectable,
         "hand_eye_if_missed": candidate.hand_eye,
+        "shape_if_missed": candidate.shape,
         "aliases": [{"effect": name, "correlation": alike} for name, alike in candidate.aliases.items()],
         "tier": ranked.score.candidate.effect.tier,
     }
@@ -161,6 +162,7 @@ DIAGNOSIS = Document(
         write=lambda d: rows_of_fields(d.depends_on, "covariate place score p_value bins mean sigma shape"),
     ),
     Key("laws", write=_law_rows),
+    Key("places"),
     # Along what a joint errs by no known law, in the unit of its covariate; errors in rad.
     Key("joint_laws", write=lambda d: rows_of_fields(d.curves, "joint covariate share at error sigma may_follow")),
     Key("time_law", write=lambda d: _time_law(d.time_curve)),

@@ -120,7 +120,8 @@ def _error_location(diagnosis: Diagnosis) -> str:
         return ": the scanner or the part's shape is wrong, not only the poses"
     follows = [x.covariate for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
     if follows:
-        return f": the remaining error follows {' and '.join(follows[:2])}"
+        where = f", at {' or '.join(diagnosis.places)}" if diagnosis.places else ""
+        return f": the remaining error follows {' and '.join(follows[:2])}{where}"
     # The likeliest name, and why it does not hold.
     return f": {diagnosis.notes[0]}" if diagnosis.notes else ""
 

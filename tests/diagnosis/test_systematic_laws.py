@@ -60,11 +60,11 @@ def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, w
     laws = [law for law in dictionary_of(linear).laws if law.key == (place, follows) and law.is_whole]
     law = next(law for law in laws if law.words == words)
     size = np.zeros(len(law.sizes))
-    size[-1] = 1e-3 if law.place.joint else 0.3
+    size[0 if law.place.joint else 3] = 1e-3 if law.place.joint else 0.3
     found = rank_laws(shown(linear, law.reduced(linear.observation) @ size), dictionary_of(linear))
     assert law_of(found[0]).key == law.key and stands_out(found[0])
     value, sigma, _ = law_size(linear, found[0])
-    moved = np.ptp(law.shapes, axis=0).max() * size[-1]
+    moved = np.ptp(law.shapes, axis=0).max() * size.max()
     assert abs(value - moved) < 4 * sigma + (0.3 if law.place.joint is None else 0.0) * moved
 
 

@@ -76,7 +76,7 @@ def test_undoing_a_scanner_effect_gives_the_true_points(name):
     plain, bent = hidden_pair(name, "eye_to_hand")
     measurement = chain_for(bent)
     effect = EFFECTS[name]
-    values = np.array([bent.hidden[name][p.name] for p in parameters_in(measurement, effect)])
+    values = np.array([bent.hidden[name].get(p.name, 0.0) for p in parameters_in(measurement, effect)])
     mended = corrected_capture(measurement, Model(bent.T_mount, (term_of(measurement, effect).at(values),)))
     for scan, true, wrong in zip(mended.scans, plain.clouds, bent.clouds, strict=True):
         before = np.abs(wrong.points - true.points).max()

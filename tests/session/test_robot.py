@@ -142,7 +142,9 @@ def test_wrong_rows_are_another_arm(convention):
         for r, a, d, alpha in zip(rows, da, dd, dalpha, strict=True)
     ]
     q = rng.uniform(-2, 2, (7, 6))
-    found = forward_with_errors(arm_of(convention, rows), q, Links(np.full(7, 1.001), np.ones((7, len(da))), da, dd, dalpha))
+    found = forward_with_errors(
+        arm_of(convention, rows), q, Links(np.full(7, 1.001), np.ones((7, len(da))), da, dd, dalpha)
+    )
     assert np.allclose(found, forward(arm_of(convention, other), q), atol=1e-9)
 
 
@@ -152,7 +154,9 @@ def test_slopes_of_the_flange_are_finite_differences(convention):
     rng, step = np.random.default_rng(1), 1e-5
     arm = replace(arm_of("modified" if convention == "modified" else "standard", rows_from(rng)), convention=convention)
     q = rng.uniform(-2, 2, (5, 6))
-    at = Links(1 + rng.normal(0, 1e-2, 5), 1 + rng.normal(0, 1e-2, (5, 6)), *rng.normal(0, [[3.0], [3.0], [1e-2]], (3, 6)))
+    at = Links(
+        1 + rng.normal(0, 1e-2, 5), 1 + rng.normal(0, 1e-2, (5, 6)), *rng.normal(0, [[3.0], [3.0], [1e-2]], (3, 6))
+    )
     slopes = flange_slopes(arm, q, at)
 
     def difference(up, down):
