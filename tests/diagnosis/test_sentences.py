@@ -59,11 +59,8 @@ def test_more_than_an_expected_scatter_is_said_with_what_is_expected():
         follows_field=False,
         scanner_error=None,
         laws=(),
-<<<<<<< HEAD
         rival_trend="",
-=======
         places=(),
->>>>>>> f4005a06 (Gravity's step, turns and shifts among the laws; places are told where no law can be; what overlaps cannot show is said)
     )
     told = diagnosis_sentence(found, "mm", None)
     assert "ordinary arms stay below 40 µm and 0.045 mrad. So more is left than scatter explains." in told
