@@ -48,7 +48,7 @@ def test_joints_are_those_that_the_cell_can_show():
 
 
 def test_laws_have_the_names_and_places_of_the_contract():
-    places = {"points": 8, "base": 1, "joints": 10, "arm": 2, "mount": 6, "part": 4, "surface": 2}
+    places = {"points": 8, "base": 1, "joints": 10, "arm": 3, "mount": 6, "part": 4, "surface": 2}
     assert {place: sum(law.place == place for law in nature.LAWS.values()) for place in places} == places
     assert set(nature.SMALL) <= set(nature.LAWS)
 
