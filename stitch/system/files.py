@@ -19,9 +19,13 @@ from pathlib import Path
 from stitch.errors import BusyError
 
 try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+    from fcntl import LOCK_EX, LOCK_NB, flock
+except ImportError:
+    from msvcrt import LK_NBLCK, locking  # type: ignore[attr-defined, unused-ignore]
+
+    ON_WINDOWS = True
+else:
+    ON_WINDOWS = False
 
 _AT_FDCWD = -100  # AT_FDCWD of Linux
 _RENAME_EXCHANGE = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
@@ -157,7 +161,7 @@ def _preserve_file(file: Path, place: Path) -> None:
         place.mkdir(exist_ok=True)
         return
     try:
-        os.link(file, place, follow_symlinks=False)
+        os.link(file, place, follow_symlinks=ON_WINDOWS)
     except OSError:
         if file.is_symlink():
             place.symlink_to(file.readlink())
@@ -205,6 +209,15 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
         yield
     finally:
         del _held[lock]
+        _let_go(lock, descriptor)
+
+
+def _let_go(lock: Path, descriptor: int) -> None:
+    if ON_WINDOWS:  # where no open file can be removed, and one that the next writer has opened stays
+        os.close(descriptor)
+        with suppress(PermissionError):
+            lock.unlink(missing_ok=True)
+    else:
         lock.unlink(missing_ok=True)
         os.close(descriptor)
 
@@ -214,9 +227,11 @@ def _locked(lock: Path, what: Path) -> int:
         with report_errors_as(what, lock):
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
-            if fcntl is not None:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+            if ON_WINDOWS:
+                locking(descriptor, LK_NBLCK, 1)
+            else:
+                flock(descriptor, LOCK_EX | LOCK_NB)
+        except (BlockingIOError, PermissionError):
             os.close(descriptor)
             raise BusyError(
                 f"{what}: another stitch is writing there; wait until it has ended, or name another folder"
@@ -249,8 +264,9 @@ def sync_to_disk(path: Path) -> None:
         for entry in path.iterdir():
             sync_to_disk(entry)
     try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except OSError:  # folders cannot be opened everywhere
+        # Windows waits only for a file that is open for writing.
+        descriptor = os.open(path, os.O_RDWR if ON_WINDOWS else os.O_RDONLY)
+    except OSError:  # folders cannot be opened everywhere, files without the right to write not on Windows
         return
     try:
         os.fsync(descriptor)

@@ -1,7 +1,7 @@
 """Calls of foreign code that must end in time.
 
-A watching thread interrupts the main thread once a call is due; what cannot be interrupted ends the process, where that
-is a command.
+A watching thread interrupts the main thread once a call is due; what cannot be interrupted, on Windows everything, ends
+the process, where that is a command.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from stitch.errors import InputError
 # Seconds from the interruption to the end of the process, and between two looks.
 _GRACE = 3.0
 _STEP = 0.25
+_ALARM = getattr(signal, "SIGALRM", None)  # Windows has none
 _running: dict[int, _Call] = {}  # by thread
 _ends_process = False
 _watch: threading.Thread | None = None
@@ -62,11 +63,11 @@ def running_over() -> bool:
 
 def _start_watch() -> None:
     global _watch
-    if _watch is not None or not hasattr(signal, "SIGALRM"):
+    if _watch is not None:
         return
     _watch = threading.Thread(target=_check_calls, name="stitch-time-limit", daemon=True)
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGALRM, _interrupt_call)
+    if _ALARM is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(_ALARM, _interrupt_call)
     _watch.start()
 
 
@@ -84,8 +85,8 @@ def _check_calls() -> None:
         for call in list(_running.values()):
             if not call.interrupted and now > call.due:
                 call.interrupted = True
-                if main is not None and signal.getsignal(signal.SIGALRM) is _interrupt_call:
-                    signal.pthread_kill(main, signal.SIGALRM)
+                if main is not None and _ALARM is not None and signal.getsignal(_ALARM) is _interrupt_call:
+                    signal.pthread_kill(main, _ALARM)
             elif call.interrupted and now > call.due + _GRACE and _ends_process:
                 print(f"stitch: {call.message}", file=sys.stderr, flush=True)
                 os._exit(InputError.exit_code)

@@ -241,3 +241,19 @@ def test_two_sessions_of_scans_are_run_with_their_recordings_and_diagnosed_toget
     stitch_command("run", *(tmp_path / name for name in names), "-o", tmp_path / "rig")
     assert {path.parent.name for path in (tmp_path / "rig").glob("*/recording.rrd")} == set(names)
     assert "together: they show no effect of their arm" in stitch_command("diagnose", tmp_path / "rig")
+
+
+def test_a_run_is_replaced_and_diagnosed_where_no_open_file_can_be_removed(session, tmp_path):
+    windows = Path(__file__).parents[1] / "as_on_windows.py"
+    # Text without a stated encoding is an error, and the terminal knows the letters of Western Europe only.
+    strict = {
+        "PYTHONIOENCODING": "cp1252",
+        "PYTHONWARNDEFAULTENCODING": "1",
+        "PYTHONWARNINGS": "error::EncodingWarning",
+    }
+    for words in (["run", session, "-o", "out"], ["run", session, "-o", "out"], ["diagnose", "out"]):
+        command = [sys.executable, windows, *map(str, words)]
+        done = subprocess.run(command, cwd=tmp_path, env=os.environ | strict, capture_output=True, encoding="cp1252")
+        assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"out", session.name}
+    assert (tmp_path / "out" / "diagnosis.json").is_file()

@@ -3,10 +3,10 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from stitch.errors import InputError
 from stitch.system import files
 from stitch.system.files import claim_folder, only_writer, rewrite_folder
 
@@ -105,21 +105,56 @@ def test_an_end_at_any_moment_of_a_change_in_place_is_made_good(run, monkeypatch
     assert contents(run) in (before, KEPT | {"model": "new"})
 
 
-def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path):
-    lock = tmp_path / ".r.lock"
-    code = f"""
+WINDOWS = Path(__file__).parents[1] / "as_on_windows.py"
+HERE_OR_THERE = {"here": "", "windows": f"import runpy; runpy.run_path({str(WINDOWS)!r})['behave_as_windows']()"}
+HOLDING = """
 import sys, time
 from pathlib import Path
 from stitch.system.files import only_writer
-with only_writer(Path({str(lock)!r}), Path("r")):
+with only_writer(Path(sys.argv[1]), Path("r")):
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(float(sys.argv[2]))
 """
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(InputError, match="r: another stitch is writing there"), only_writer(lock, "r"):
-            pass
-        other.kill()
+FILE_IN_USE = """
+import sys
+from pathlib import Path
+from stitch.system.files import rewrite_folder
+run = Path(sys.argv[1])
+with open(run / "notes"):
+    try:
+        with rewrite_folder(run, lambda inside: inside.name in ("model", "result")) as scratch:
+            (scratch / "model").write_text("new", encoding="utf-8")
+    except PermissionError as error:
+        print(error)
+"""
+
+
+def python(machine, code, *arguments):
+    return [sys.executable, "-c", f"{HERE_OR_THERE[machine]}\n{code}", *map(str, arguments)]
+
+
+@pytest.mark.parametrize("machine", HERE_OR_THERE)
+def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path, machine):
+    lock = tmp_path / ".r.lock"
+    with subprocess.Popen(python(machine, HOLDING, lock, 60), stdout=subprocess.PIPE) as first:
+        assert first.stdout.readline() == b"held\n"
+        second = subprocess.run(python(machine, HOLDING, lock, 0), capture_output=True, text=True)
+        assert "r: another stitch is writing there" in second.stderr
+        first.kill()
+    subprocess.run(python(machine, HOLDING, lock, 0), check=True, capture_output=True)
+    assert not lock.exists()
+
+
+def test_a_block_within_a_block_of_one_process_holds_the_lock_with_it(tmp_path):
+    lock = tmp_path / ".r.lock"
     with only_writer(lock, "r"), only_writer(lock, "r"):
         assert lock.exists()
     assert not lock.exists()
+
+
+def test_a_folder_whose_file_is_in_use_stays_as_it_was_where_it_cannot_move(run, tmp_path):
+    before = contents(run)
+    said = subprocess.run(python("windows", FILE_IN_USE, run), capture_output=True, text=True, check=True)
+    assert "used by another process" in said.stdout
+    assert contents(run) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

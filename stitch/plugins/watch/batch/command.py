@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -66,6 +67,8 @@ def batch(
         raise InputError(
             f"{output}: sessions of a store beside some of this disk; to fix: name sessions and -o of stores"
         )
+    if memory and find_spec("resource") is None:
+        raise InputError("--session-memory: Windows bounds no process; to fix: leave it away, or use `--store small`")
     bounds: dict[str, Any] = {
         "small": store == "small",
         "seconds": seconds,
