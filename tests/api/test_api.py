@@ -429,3 +429,15 @@ def test_a_log_is_read_as_the_line_of_python_reads_it(robot, tmp_path):
     found = readings(layout)[0].T.copy()
     found[:, :3, 3] *= 1e3 if layout.length_unit == "m" else 1.0
     assert np.abs(found - T).max() < 1e-5
+
+
+def test_the_hand_eye_that_moveit_saves_is_the_start(tmp_path, monkeypatch):
+    R, t = Rotation.from_rotvec([0.1, -0.4, 2.0]), [0.05, -0.02, 0.11]
+    args = " ".join(map(repr, [*t, *R.as_quat().tolist()]))
+    node = f'<node pkg="tf2_ros" type="static_transform_publisher" name="eye" args="{args} tool0 camera" />'
+    (tmp_path / "hand_eye.launch").write_text(f"<launch>\n  {node}\n</launch>\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(block("MoveIt's hand-eye"), "MoveIt", "exec"), names)
+    assert np.allclose(names["scanner"]["pose"][:3, :3], R.as_matrix())
+    assert np.allclose(names["scanner"]["pose"][:3, 3], [50, -20, 110])

@@ -4,6 +4,7 @@ Open3D and trimesh are known by the names of their modules: whoever passes such 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.reading.clouds import cloud_of_columns
 from stitch.session.reading.depth_image import lifted
-from stitch.session.reading.intrinsics import Intrinsics
+from stitch.session.reading.intrinsics import Intrinsics, intrinsics_of_level
 from stitch.session.reading.scan_files import measured_pixels
 from stitch.session.reading.text_files import require_name
 from stitch.session.session import Cloud, Sighting
@@ -25,6 +26,7 @@ _KNOWN = (
     "(N, 3) or (H, W, 3) numbers, a structured array with x, y, z, a mapping with points, a PointCloud of trimesh or "
     "Open3D, or (depth image, intrinsics)"
 )
+_OF_REALSENSE = ("fx", "fy", "ppx", "ppy", "coeffs")
 _NORMALS = ("nx", "ny", "nz")
 _COLOURS = ("red", "green", "blue")
 # A matrix that is a rotation within the first is taken as it is, to the last digit; within the second it is made one.
@@ -171,21 +173,26 @@ def _pixels(image: Any) -> Array:
 
 
 def _intrinsics(item: Any, where: str) -> Intrinsics:
-    """Read a PinholeCameraIntrinsic, a matrix (3, 3), or a mapping with fx, fy, cx, cy; pixels."""
-    size = None
+    """Return the lens of a PinholeCameraIntrinsic, a matrix (3, 3), RealSense's intrinsics, or what a file states."""
+    if hasattr(item, "ppx"):
+        item = {name: getattr(item, name, None) for name in (*_OF_REALSENSE, "model", "width", "height")}
     if hasattr(item, "intrinsic_matrix"):
-        size = (int(item.width), int(item.height)) if item.width > 0 else None
-        K = np.asarray(item.intrinsic_matrix, float)
-    elif isinstance(item, Mapping):
-        K = np.array([[item["fx"], 0, item["cx"]], [0, item["fy"], item["cy"]], [0, 0, 1]], float)
-    else:
-        K = np.asarray(item.cpu().numpy() if hasattr(item, "cpu") else item, float)
-    if K.shape != (3, 3) or not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        size = {"width": int(item.width), "height": int(item.height)} if item.width > 0 else {}
+        item = {"camera_matrix": item.intrinsic_matrix} | size
+    elif not isinstance(item, Mapping):
+        item = {"camera_matrix": item.cpu().numpy() if hasattr(item, "cpu") else item}
+    level = {str(name).lower(): _plain(value) for name, value in item.items()}
+    intrinsics = intrinsics_of_level(Path(where), level)
+    if intrinsics is None:
         raise InputError(
             f"{where}: the intrinsics are no matrix (3, 3) with focal lengths; to fix: pass fx, fy, cx, cy in pixels"
         )
-    fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    return Intrinsics(Path(where), fx, fy, cx, cy, distortion=np.zeros(0), size=size, units_per_metre=None)
+    return replace(intrinsics, units_per_metre=None)  # depths are in the unit that is passed
+
+
+def _plain(value: Any) -> Any:
+    """Return the lists and numbers that a file would hold."""
+    return value.tolist() if hasattr(value, "tolist") else list(value) if isinstance(value, tuple) else value
 
 
 def poses_of(poses: Any, where: str) -> Array:

@@ -90,7 +90,7 @@ def _read_intrinsics(file: Path) -> Intrinsics | None:
             document = documents[0] if documents else None
     except (ValueError, RecursionError, InputError):
         return None
-    cameras = (_intrinsics_of_level(file, level) for level in _document_levels(document))
+    cameras = (intrinsics_of_level(file, level) for level in _document_levels(document))
     return next((camera for camera in cameras if camera is not None), None)
 
 
@@ -103,7 +103,8 @@ def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
             yield from _document_levels(plain[key])
 
 
-def _intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
+def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
+    """Return the lens or the pitch that a mapping with lower-case names states, None where it states neither."""
     matrix = _camera_matrix(level)
     named = {m[2] or m[3]: level[name] for name in level if (m := _PITCH.match(name))} if matrix is None else {}
     if {"x", "y"} <= named.keys() and all(isinstance(step, (int, float)) and step > 0 for step in named.values()):
@@ -120,7 +121,14 @@ def _intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None
     height = _whole_number(level, "height", "image_height")
     size = None if width is None or height is None else (width, height)
     return Intrinsics(
-        file, fx, fy, cx, cy, distortion=_distortion(level), size=size, units_per_metre=_units_per_metre(file, level)
+        file,
+        fx,
+        fy,
+        cx,
+        cy,
+        distortion=_distortion(file, level),
+        size=size,
+        units_per_metre=_units_per_metre(file, level),
     )
 
 
@@ -153,7 +161,7 @@ def _list_numbers(value: Any) -> Array:
         return np.zeros(0)
 
 
-def _distortion(level: dict[str, Any]) -> Array:
+def _distortion(file: Path, level: dict[str, Any]) -> Array:
     inner = level.get("distortion")
     if isinstance(inner, dict):
         named = {str(key).lower(): value for key, value in inner.items()}
@@ -161,7 +169,15 @@ def _distortion(level: dict[str, Any]) -> Array:
     else:
         names = ("distortion_coefficients", "coeffs", "d", "distortion")
         distortion = next((x for name in names if len(x := _list_numbers(level.get(name)))), np.zeros(0))
-    return distortion if distortion.any() else np.zeros(0)
+    if not distortion.any():
+        return np.zeros(0)
+    law = str(level.get("distortion_model", level.get("model", "")))
+    if re.search("inverse|modified|kannala|fish.?eye|equidistant|theta", law, re.IGNORECASE):
+        raise InputError(
+            f"{file}: the lens distorts by {law}, its numbers are not OpenCV's k1, k2, p1, p2, k3; to fix: "
+            "pass the points that the scanner's own program makes of the image"
+        )
+    return distortion
 
 
 def _whole_number(level: dict[str, Any], *names: str) -> int | None:

@@ -1,5 +1,7 @@
 """Clouds and poses of every kind become what a file of the same scan gives; what is none is refused in a sentence."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -109,6 +111,23 @@ def test_a_depth_image_is_lifted_through_a_matrix_or_a_mapping():
     assert len(found) == 23 and np.allclose(found[0], [-12.5, -7.5, 500])
     lens = {"fx": 100.0, "fy": 100.0, "cx": 2.5, "cy": 1.5}
     assert np.array_equal(cloud_of((depth, lens), "v").points, found)
+
+
+def test_a_lens_that_distorts_lifts_pixels_to_points_that_opencv_projects_onto_them():
+    cv2 = pytest.importorskip("cv2")
+    coefficients = [0.1, -0.05, 0.002, -0.001, 0.01]
+    lens = SimpleNamespace(fx=20.0, fy=21.0, ppx=7.5, ppy=5.5, width=16, height=12, coeffs=coefficients)
+    lens.model = "distortion.brown_conrady"
+    stated = {"fx": 20.0, "fy": 21.0, "cx": 7.5, "cy": 5.5, "distortion": coefficients}
+    v, u = np.indices((12, 16))
+    for given in (lens, stated):
+        points = cloud_of((np.full((12, 16), 500.0), given), "v").points
+        K = np.array([[20.0, 0, 7.5], [0, 21.0, 5.5], [0, 0, 1]])
+        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(coefficients))
+        assert np.allclose(pixels[:, 0], np.column_stack([u.ravel(), v.ravel()]), atol=1e-3)
+    lens.model = "distortion.inverse_brown_conrady"
+    with pytest.raises(InputError, match="distorts by distortion.inverse_brown_conrady"):
+        cloud_of((np.full((12, 16), 500.0), lens), "v")
 
 
 @pytest.mark.parametrize(
