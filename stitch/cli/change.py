@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stitch.cli.options import EffectsFile, Json, Trust
+from stitch.cli.options import EffectsFile, Json, Trust, complete_effect
 from stitch.cli.progress import opened_run, recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
@@ -25,7 +25,10 @@ _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Wr
 
 def add(
     run: _RunFolder,
-    effects: Annotated[list[str] | None, typer.Argument(metavar="EFFECT...", help="Effects to add.")] = None,
+    effects: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="EFFECT...", help="Effects to add.", autocompletion=complete_effect),
+    ] = None,
     suggested: Annotated[bool, typer.Option("--suggested", help="Diagnose and add until nothing is left.")] = False,
     group: Annotated[bool, typer.Option("--group", help="Diagnose; add effects that it cannot tell apart.")] = False,
     at_most: Annotated[int, typer.Option("--at-most", help="Limit for --suggested.")] = _AT_MOST,
@@ -57,7 +60,9 @@ def add(
 
 def drop(
     run: _RunFolder,
-    effects: Annotated[list[str], typer.Argument(metavar="EFFECT...", help="Effects to take out.")],
+    effects: Annotated[
+        list[str], typer.Argument(metavar="EFFECT...", help="Effects to take out.", autocompletion=complete_effect)
+    ],
     effects_file: EffectsFile = None,
     trust: Trust = False,
     recording: _Recording = True,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stitch.cli.options import EffectsFile, Json
+from stitch.cli.options import EffectsFile, Json, complete_effect
 from stitch.cli.terminal import emit, say, show_columns
 
 if TYPE_CHECKING:
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 def effects(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Show one effect.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Show one effect.", autocompletion=complete_effect)
+    ] = None,
     effects_file: EffectsFile = None,
     as_json: Json = False,
 ) -> None:

@@ -24,6 +24,14 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `sti
 Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone on standard output.")]
 
 
+def complete_effect(incomplete: str) -> list[str]:
+    """Return how a name of an effect may go on, the last of a list with commas, for the tab key of a shell."""
+    from stitch.effects.contract import EFFECTS
+
+    before, comma, begun = incomplete.rpartition(",")
+    return [f"{before}{comma}{name}" for name in EFFECTS if name.startswith(begun)]
+
+
 def split_names(text: str | None) -> tuple[str, ...]:
     """Return what a list with commas names, empty places too."""
     return tuple(name.strip() for name in text.split(",")) if text else ()

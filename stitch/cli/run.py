@@ -21,6 +21,7 @@ from stitch.cli.options import (
     Tolerance,
     Trust,
     bytes_of,
+    complete_effect,
     require_tolerance,
     split_names,
 )
@@ -50,7 +51,9 @@ _Arm = Annotated[
     Path | None,
     typer.Option("--arm", metavar="RUN2", help="Keep the arm of another run (joints, links), fit all else."),
 ]
-_Effects = Annotated[str, typer.Option("--effects", help="Effects to fit, separated by commas.")]
+_Effects = Annotated[
+    str, typer.Option("--effects", help="Effects to fit, separated by commas.", autocompletion=complete_effect)
+]
 _Keep = Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")]
 _Register = Annotated[
     str | None,

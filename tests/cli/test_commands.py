@@ -14,6 +14,7 @@ import typer
 
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import build, main
+from stitch.cli.options import complete_effect
 from stitch.effects import EFFECTS
 from stitch.system.packages import stitch_version
 
@@ -95,6 +96,12 @@ def test_the_tab_key(typed, offered):
     *names, loaded = out.stdout.split()
     assert names == offered
     assert loaded == "False"
+
+
+def test_the_tab_key_knows_effects_and_goes_on_behind_a_comma():
+    assert complete_effect("mount_b") == ["mount_bend"]
+    assert complete_effect("backlash,joint_o") == ["backlash,joint_offset"]
+    assert complete_effect("nothing") == []
 
 
 def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
