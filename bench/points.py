@@ -453,10 +453,11 @@ def load_summary(rows: list[Row]) -> list[str]:
         right = share(r["together"] == ["missing_effect", name] for r in group)
         wrong = share(r["together"][0] == "missing_effect" and r["together"][1] != name for r in group)
         alone = [answer for r in group for answer in r["alone"]]
-        open_alone = share(answer[0] == "cannot_tell" for answer in alone)
+        open_alone = share(answer[0] == "cannot_tell" and name in answer for answer in alone)
+        right_alone = share(answer == ["missing_effect", name] for answer in alone)
         wrong_alone = share(answer[0] == "missing_effect" and answer[1] != name for answer in alone)
-        lines.append((name, right, wrong, open_alone, wrong_alone))
-    return markdown("hidden | together: right | wrong | alone: cannot tell | wrong", lines)
+        lines.append((name, right, wrong, open_alone, right_alone, wrong_alone))
+    return markdown("hidden | together: right | wrong | alone: cannot tell, with the truth | right | wrong", lines)
 
 
 LOADS = Table(load_jobs, load_trial, load_summary, range(100, 120), "points", "loads")
