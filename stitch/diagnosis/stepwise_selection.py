@@ -139,9 +139,9 @@ def _stable_selection(
 ) -> ForwardSelection:
     """Return effects of those chosen that hold their place, with others that then can be named.
 
-    Of those that err beyond the measured poses the one that errs most is left out, and the search goes on: what it
-    imitated others may explain. At last one that errs at some end gives way to another that does the same and is
-    likelier to hold beyond.
+    Of those that err beyond the measured poses, beside the likeliest further effect too, the one that errs most is left
+    out, and the search goes on: what it imitated others may explain. At last one that errs at some end gives way to
+    another that does the same and is likelier to hold beyond.
     """
     remaining = list(candidates)
     exchanged = set[str]()
@@ -150,12 +150,15 @@ def _stable_selection(
     explained = sum(r.log_posterior for r in chosen)
     while True:
         chosen, beyond = _eliminate_backward(linear, chosen, len(remaining))
-        erring = {name: at_ends for name, at_ends in beyond.items() if at_ends is not None and not at_ends.helps}
+        at_all_ends = zip(chosen, beyond.values(), strict=True)
+        erring = [(r, at_ends) for r, at_ends in at_all_ends if at_ends is not None and not at_ends.helps]
+        erring.sort(key=lambda each: -each[1].share)
+        worst = next((each for each in erring if not _helps_beside_next(linear, remaining, chosen, each[0])), None)
         replacement: Ranked | None = None
-        if erring:
-            name = max(erring, key=lambda name: erring[name].share)
-            refused[name] = erring[name].rejection_reason(name)
-            (unseen.add if erring[name].unseen else unseen.discard)(name)
+        if worst is not None:
+            name, at_ends = worst[0].name, worst[1]
+            refused[name] = at_ends.rejection_reason(name)
+            (unseen.add if at_ends.unseen else unseen.discard)(name)
         else:
             rivals = [c for c in candidates if c.name not in exchanged]
             exchange = find_exchange(linear, rivals, chosen, beyond)
@@ -173,6 +176,22 @@ def _stable_selection(
         refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
     likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
     return ForwardSelection(likeliest_first, explained, refused)
+
+
+def _helps_beside_next(
+    linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked], r: Ranked
+) -> bool:
+    """Return whether one of the effects helps at the ends beside the likeliest further one, which is too little to be
+    named: without that it takes a part of it for its own, and carries it beyond."""
+    beside = conditioned_on_effects(linear, chosen)
+    further = promising(beside, [c for c in candidates if c.name not in {r.name for r in chosen}], 1)
+    if not further or further[0][1] < 0:
+        return False
+    second = rank_one(beside, further[0][0], len(candidates))
+    rest = conditioned_without(linear, [*chosen, second], r)
+    again = rank_one(rest, r.score.candidate, len(candidates))
+    at_ends = extrapolate(rest, again.score) if is_certain(again) else None
+    return at_ends is not None and at_ends.helps
 
 
 def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:

@@ -61,8 +61,13 @@ _MOST_OFF = 1 / 3
 _SHAPE, _TIMES_USUAL, _OFFSET, _MOST_ASKED = 0.5, 2.0, 4.0, 4
 
 
-def find_stock(session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping) -> dict[int, Stock]:
+def find_stock(
+    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
+) -> Mapping[int, Stock | None]:
     """Return the stock of the view that shows it most clearly; {} where none does.
+
+    Where too many have shown it one after the other, that is the scanner's error or the surface's: None for each from
+    which it was taken.
 
     Args:
         T_mount: (4, 4) hand-eye under which `snooping` was made.
@@ -70,13 +75,15 @@ def find_stock(session: SessionData, capture: Capture, T_mount: Array, snooping:
     unconstrained = snooping.unconstrained
     scatter = repeatability_from(snooping.blunder_search.fit.variances)
     off = sorted({m.view for m in (*snooping.misplaced, *snooping.suspected)})
-    if len(capture.scans) - len(off) <= _FEWEST_VIEWS or len(off) > _MOST_OFF * len(capture.scans):
+    most = _MOST_OFF * len(capture.scans)
+    if capture.none_has_stock or len(capture.scans) - len(off) <= _FEWEST_VIEWS or len(off) > most:
         return {}
+    taken = [v for v, scan in enumerate(capture.scans) if scan.stock is not None]
     for view in _asked(capture, T_mount, unconstrained, scatter, off):
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None:
-            return {view: stock}
+            return {view: stock} if len(taken) + 1 <= most else dict.fromkeys(taken)
     return {}
 
 

@@ -53,7 +53,7 @@ class ViewScreening:
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
     hand_eye: HandEyeTransfer | None = None  # of a given one, against that of the views
-    stock: Mapping[int, Stock] = field(default_factory=dict)  # that has to be taken off before anything else is asked
+    stock: Mapping[int, Stock | None] = field(default_factory=dict)  # taken off before anything else is asked
 
     @property
     def names(self) -> set[str]:

@@ -84,6 +84,7 @@ class Capture:
     # How much more the views scatter than the variance of the surfaces' distances says, for so many of them:
     # what clouds weigh beside labelled points.
     noise_factor: float = 1.0
+    none_has_stock: bool = False  # too many seemed to: what stands off is the scanner's error, or the surface's
 
     @property
     def scanner_rides(self) -> bool:
@@ -121,10 +122,10 @@ class Capture:
         """Return (V, 4, 4) whose adjoint carries a right perturbation of the hand-eye into the reference frame."""
         return self.T_reference_mount @ T_mount_scanner
 
-    def without_stock(self, stock: Mapping[int, Stock]) -> "Capture":
-        """Return the capture with stock taken off the scans of some views."""
-        of_views = enumerate(self.scans)
-        return replace(self, scans=tuple(without_stock(s, stock[v]) if v in stock else s for v, s in of_views))
+    def without_stock(self, stock: Mapping[int, Stock | None]) -> "Capture":
+        """Return the capture with stock taken off the scans of some views; None: given back, and not asked of again."""
+        scans = tuple(without_stock(s, stock[v]) if v in stock else s for v, s in enumerate(self.scans))
+        return replace(self, scans=scans, none_has_stock=self.none_has_stock or None in stock.values())
 
     def without(self, left_out: Indices) -> "Capture":
         """Return the capture less some views."""

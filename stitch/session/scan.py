@@ -104,9 +104,12 @@ class Neighbourhoods:
     spacing: float  # median distance to the nearest one, length_unit
 
 
-def without_stock(scan: Scan, stock: Stock) -> Scan:
-    """Return the scan with stock taken off: points on it moved back along their normals."""
-    points = scan.points - stock.thickness * stock.points[:, None] * scan.normals
+def without_stock(scan: Scan, stock: Stock | None) -> Scan:
+    """Return the scan with stock taken off: points on it moved back along their normals; None: with what was taken."""
+    taken = stock or scan.stock
+    assert taken is not None
+    outwards = taken.points[:, None] * (taken.thickness if stock else -taken.thickness)
+    points = scan.points - outwards * scan.normals
     return replace(scan, points=points, tree=KDTree(points, leafsize=16), stock=stock)
 
 

@@ -14,6 +14,7 @@ from data_synth.shapes.casting import with_stock
 from data_synth.write import write_session
 from stitch.api.pipeline import run
 from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
 
 CELL = {"seed": 2, "views": 10, "pixels": 80}
 VIEW = 8
@@ -61,3 +62,20 @@ def test_a_displaced_view_is_never_called_stock(turn):
 
 def test_a_clean_session_has_no_stock():
     assert run(session_of(measured_blade(**CELL))).doubts == ()
+
+
+def test_where_more_than_a_third_of_the_views_stand_off_what_was_taken_is_given_back():
+    """No other says what their surface is: the scans are as they were measured."""
+    clean = measured_blade(**CELL)
+    mesh_for = quiet_scenes.mesh_for
+    with patch(
+        "data_synth.fixtures.quiet_scenes.mesh_for",
+        lambda scene: with_stock(mesh_for(scene), lambda p: 0.15 + 0 * p[:, 0]),
+    ):
+        grown = measured_blade(**CELL).clouds
+    clouds = [grown[v] if v in (1, 3, 5, 8) else cloud for v, cloud in enumerate(clean.clouds)]
+    session = session_of(replace(clean, clouds=clouds))
+    found = run(session)
+    assert found.measurement.capture.none_has_stock and found.doubts == ()
+    for scan, untouched in zip(found.measurement.capture.scans, prepare_capture(session).scans, strict=True):
+        assert scan.stock is None and np.allclose(scan.points, untouched.points, atol=1e-9)
