@@ -1,7 +1,8 @@
 """Which further views decide between rival effects, and how likely: by simulation over the rivals and the scatter.
 
 Each rival, with hand-eye and effects in use fitted beside it, predicts what a further view would show: a mean and a
-covariance (of what it does not know of itself, of the arm's errors, of scatter and noise). A view is worth as much as
+covariance (of what it does not know of itself, of the arm's errors, of scatter and noise). It does so in each form that
+its views leave likely, of a time constant, a joint, a view from which it acts. A view is worth as much as
 these predictions differ for what they are known to (Box & Hill 1967, Technometrics 9:57; Atkinson & Fedorov 1975,
 Biometrika 62:57). Every rival in turn is taken for the true one and its views are drawn; that one is decided for which
 is then twenty times likelier than all others, as a diagnosis asks.
@@ -48,8 +49,10 @@ MOST_VIEWS, SURE = 3, 0.95
 _WORTH = 0.02
 # Draws of each rival for the search, and for the odds that are stated.
 _SEARCH_DRAWS, _STATED_DRAWS = 96, 2000
+# Forms of a rival that compete, of those within so many nats of its best.
+_FORMS, _NEAR_FORMS = 5, 6.0
 # Shares of the session's duration that one may wait where a rival goes with time.
-_WAITS = (0.0, 0.25, 0.5, 1.0)
+_WAITS = (0.0, 0.5, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -112,16 +115,44 @@ def deciding_views(
     joints = possible_joints(linear)[:_TRIED]
     if not len(joints):
         return None
-    first = _choose(linear, scores, log_weights, joints, most)
+    forms = competing_forms(scores, log_weights)
+    first = _choose(linear, forms, joints, most)
     best = joints[np.argsort(-first.single, kind="stable")[:_BEST]]
     closer = possible_joints(linear, best)[:_CLOSER]
     both = np.concatenate([best, joints[first.chosen], closer])
-    choice = _choose(linear, scores, log_weights, np.unique(both.round(9), axis=0), most)
+    choice = _choose(linear, forms, np.unique(both.round(9), axis=0), most)
     if not choice.chosen:
         return None
     return DecidingViews(
         choice.joints[choice.chosen], choice.wait[choice.chosen], np.array(choice.probability), choice.wrong
     )
+
+
+@dataclass(frozen=True)
+class RivalForms:
+    """Forms of all rivals, each as a score of its own."""
+
+    scores: list[Score]
+    log_weights: Array  # (F,) not normalised
+    rival: Indices  # (F,) whose form it is
+
+
+def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
+    """Return the likeliest forms of each rival, which share its weight (R,)."""
+    forms = list[Score]()
+    weights = list[float]()
+    rival = list[int]()
+    for r, scored in enumerate(scores):
+        every, shares = scored.candidate.forms, scored.log_shares
+        if shares is None:
+            every, shares = (scored.form,), np.zeros(1)
+        likeliest = np.argsort(-shares, kind="stable")[:_FORMS]
+        kept = [i for i in likeliest if shares[i] > shares.max() - _NEAR_FORMS and every[i].columns.any()]
+        of_rival = log_weights[r] + shares[kept] - np.logaddexp.reduce(shares[kept])
+        forms += [replace(scored, form=every[i]) for i in kept]
+        weights += of_rival.tolist()
+        rival += [r] * len(kept)
+    return RivalForms(forms, np.array(weights), np.array(rival))
 
 
 @dataclass(frozen=True)
@@ -134,27 +165,27 @@ class _Choice:
     wrong: float
 
 
-def _choose(linear: LinearModel, scores: Sequence[Score], log_weights: Array, joints: Array, most: int) -> _Choice:
+def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> _Choice:
     """Return the views that are chosen one after the other among joints (N, n)."""
-    wait = _waits(linear, scores, len(joints))
-    predictions = predict_views(linear, scores, joints, wait)
+    wait = _waits(linear, forms.scores, len(joints))
+    predictions = predict_views(linear, forms.scores, joints, wait)
     m = predictions[0].mean.shape[1]
     every: Indices = np.arange(len(joints), dtype=np.int64)
     rng = np.random.default_rng(0)
-    weights = np.exp(log_weights - log_weights.max())
-    true_share = float(np.sum((weights / weights.sum()) ** 2))
+    weights = np.exp(forms.log_weights - forms.log_weights.max())
+    true_share = float(np.sum((np.bincount(forms.rival, weights) / weights.sum()) ** 2))
     chosen = list[int]()
     probability = list[float]()
     single, wrong = np.zeros(len(joints)), 0.0
     while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
-        of_true = _decisions(predictions, log_weights, chosen, every, draws)[2]
+        of_true = _decisions(predictions, forms, chosen, every, draws)[2]
         of_true[chosen] = -1.0
         if not chosen:
             single = of_true
         k = int(of_true.argmax())
         stated = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
-        right, missed, share = _decisions(predictions, log_weights, chosen, every[k : k + 1], stated)
+        right, missed, share = _decisions(predictions, forms, chosen, every[k : k + 1], stated)
         if share[0] < true_share + _WORTH:
             break
         chosen.append(k)
@@ -164,7 +195,7 @@ def _choose(linear: LinearModel, scores: Sequence[Score], log_weights: Array, jo
 
 
 def _decisions(
-    predictions: Sequence[Prediction], log_weights: Array, chosen: Sequence[int], more: Indices, draws: Array
+    predictions: Sequence[Prediction], forms: RivalForms, chosen: Sequence[int], more: Indices, draws: Array
 ) -> tuple[Array, Array, Array]:
     """Return for each of `more` (C,) the probabilities that the true rival is named after it, that a wrong one is, and
     the mean probability of the true one.
@@ -176,26 +207,27 @@ def _decisions(
     halves = [np.linalg.cholesky(covariance) for _, covariance in parts]
     inverses = [np.linalg.inv(half) for half in halves]
     sizes = [np.log(np.diagonal(half, axis1=1, axis2=2)).sum(axis=1) for half in halves]
-    weights = np.exp(log_weights - log_weights.max())
+    weights = np.exp(forms.log_weights - forms.log_weights.max())
     weights = weights / weights.sum()
+    rivals = range(int(forms.rival.max()) + 1)
     right, wrong, share = np.zeros((3, len(more)))
-    for g, ((mean, _), half) in enumerate(zip(parts, halves, strict=True)):
+    for weight, true, (mean, _), half in zip(weights, forms.rival, parts, halves, strict=True):
         seen = mean[:, None] + draws @ half.transpose(0, 2, 1)
-        fits = np.array(
+        of_forms = np.array(
             [
-                log_weight - size[:, None] - 0.5 * np.sum(((seen - other) @ back.transpose(0, 2, 1)) ** 2, axis=2)
-                for log_weight, size, (other, _), back in zip(
-                    log_weights, sizes, [(m[:, None], c) for m, c in parts], inverses, strict=True
-                )
+                log_weight
+                - size[:, None]
+                - 0.5 * np.sum(((seen - other[:, None]) @ back.transpose(0, 2, 1)) ** 2, axis=2)
+                for log_weight, size, (other, _), back in zip(forms.log_weights, sizes, parts, inverses, strict=True)
             ]
         )
-        rival = np.delete(fits, g, axis=0)
-        ahead = fits[g] - rival.max(axis=0)
-        right += weights[g] * (ahead > ODDS).mean(axis=1)
+        fits = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
+        ahead = fits[true] - np.delete(fits, true, axis=0).max(axis=0)
+        right += weight * (ahead > ODDS).mean(axis=1)
         # The best of the others, ahead of all that are left.
         order = np.sort(fits, axis=0)
-        wrong += weights[g] * ((ahead < 0) & (order[-1] - order[-2] > ODDS)).mean(axis=1)
-        share += weights[g] * np.exp(fits[g] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
+        wrong += weight * ((ahead < 0) & (order[-1] - order[-2] > ODDS)).mean(axis=1)
+        share += weight * np.exp(fits[true] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
     return right, wrong, share
 
 
@@ -389,4 +421,4 @@ def model_beside(linear: LinearModel, scored: Score) -> LinearModel:
 
 def zero_term(scored: Score) -> Term:
     """Return the candidate's best form at zero."""
-    return scored.form.at(np.zeros(len(scored.values)))
+    return scored.form.at(np.zeros(len(scored.form.sizes)))

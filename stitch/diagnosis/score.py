@@ -53,6 +53,7 @@ class Score:
     variances: Array | None = None  # (c,) beside the best form; None where it was not worth a fit
     # with the pose errors that remain beside the best form, where these have a prior
     base_model: LinearModel | None = None
+    log_shares: Array | None = None  # (F,) nats of every form, with its share of the prior
 
     @property
     def name(self) -> str:
@@ -118,7 +119,8 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     k = max(range(len(trials)), key=lambda i: trials[i].log_bayes_factor)
     best = trials[k]
     form = candidate.forms[k]
-    gained = float(logsumexp(np.array([trial.log_bayes_factor for trial in trials]) + np.log(weights)))
+    log_shares = np.array([trial.log_bayes_factor for trial in trials]) + np.log(weights)
+    gained = float(logsumexp(log_shares))
     p_value = float(min(1.0, np.min(np.array([trial.p_value for trial in trials]) / weights)))
     values = np.zeros(len(form.sizes))
     covariance = np.diag(values + np.nan)
@@ -139,6 +141,7 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
         scale=best.scale,
         variances=best.variances,
         base_model=beside,
+        log_shares=log_shares,
     )
 
 

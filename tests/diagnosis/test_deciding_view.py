@@ -12,7 +12,14 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, plan_for
 from data_synth.simulate import simulate
 from stitch.diagnosis import deciding_view
-from stitch.diagnosis.deciding_view import Prediction, deciding_views, possible_joints, predict_views
+from stitch.diagnosis.deciding_view import (
+    Prediction,
+    RivalForms,
+    competing_forms,
+    deciding_views,
+    possible_joints,
+    predict_views,
+)
 from stitch.diagnosis.effect_trend import trend_in_model, trends_of_candidates
 from stitch.diagnosis.thresholds import ODDS
 from stitch.numerics import frames
@@ -26,12 +33,17 @@ def prediction(mean, sigma):
     return Prediction(np.array([[mean]]), np.zeros((1, 1, 1)), None, np.full((1, 1, 1), sigma**2), np.zeros((1, 1, 0)))
 
 
+def alike(count):
+    """Rivals of one form each, equally likely."""
+    return RivalForms([], np.zeros(count), np.arange(count))
+
+
 @pytest.mark.parametrize("apart", [2.0, 3.0, 5.0])
 def test_the_odds_of_two_rivals_that_differ_in_one_number_are_those_of_the_closed_form(apart):
     """The log likelihood ratio of two normals δ sigmas apart is itself normal: mean δ²/2, variance δ²."""
     draws = np.random.default_rng(0).standard_normal((40_000, 1))
     rivals = [prediction(0.0, 0.02), prediction(0.02 * apart, 0.02)]
-    right, wrong, _ = deciding_view._decisions(rivals, np.zeros(2), [], np.zeros(1, int), draws)
+    right, wrong, _ = deciding_view._decisions(rivals, alike(2), [], np.zeros(1, int), draws)
     assert right[0] == pytest.approx(norm.cdf((apart**2 / 2 - ODDS) / apart), abs=0.01)
     assert wrong[0] == pytest.approx(norm.cdf((-(apart**2) / 2 - ODDS) / apart), abs=0.005)
 
@@ -39,8 +51,18 @@ def test_the_odds_of_two_rivals_that_differ_in_one_number_are_those_of_the_close
 def test_a_view_in_which_the_rivals_expect_the_same_decides_nothing():
     draws = np.random.default_rng(0).standard_normal((1000, 1))
     rivals = [prediction(0.1, 0.02), prediction(0.1, 0.02)]
-    right, wrong, share = deciding_view._decisions(rivals, np.zeros(2), [], np.zeros(1, int), draws)
+    right, wrong, share = deciding_view._decisions(rivals, alike(2), [], np.zeros(1, int), draws)
     assert (right[0], wrong[0], share[0]) == (0.0, 0.0, 0.5)
+
+
+def test_a_rival_that_may_take_the_form_of_another_leaves_that_one_unnamed():
+    """With half of its weight on the same prediction no view makes the other more than twice as likely."""
+    draws = np.random.default_rng(0).standard_normal((20_000, 1))
+    predictions = [prediction(0.0, 0.02), prediction(0.0, 0.02), prediction(0.4, 0.02)]
+    forms = RivalForms([], np.log([0.5, 0.25, 0.25]), np.array([0, 1, 1]))
+    right, wrong, share = deciding_view._decisions(predictions, forms, [], np.zeros(1, int), draws)
+    assert right[0] == pytest.approx(0.25, abs=1e-3) and wrong[0] == 0.0
+    assert share[0] == pytest.approx(0.5 * 2 / 3 + 0.25 / 3 + 0.25, abs=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +117,10 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
     rivals = rivals_of(found)
     views = deciding_views(found.linear, rivals, most=1)
     joints = possible_joints(found.linear)[:40]
-    weights = np.array([ranked.log_posterior for ranked in rivals])
-    tried = predict_views(found.linear, [r.score for r in rivals], joints, np.zeros(len(joints)))
+    forms = competing_forms([r.score for r in rivals], np.array([r.log_posterior for r in rivals]))
+    tried = predict_views(found.linear, forms.scores, joints, np.zeros(len(joints)))
     draws = np.random.default_rng(5).standard_normal((2000, 6))
-    right = deciding_view._decisions(tried, weights, [], np.arange(len(joints)), draws)[0]
+    right = deciding_view._decisions(tried, forms, [], np.arange(len(joints)), draws)[0]
     assert views.probability[0] > right.max() - 0.05
 
 
