@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
+from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.systematic_laws import law_of, law_size
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
@@ -18,6 +19,7 @@ from stitch.output.result_document import parameter_row
 from stitch.output.schema import NUMBER, NUMBER_OR_NULL, TEXT, Document, Key, Kind, list_of, rows_of_fields
 
 FORMAT = "stitch-diagnosis/1"
+_RIVALS = 5  # the likeliest, which stand beside a candidate
 # Of a cross-validation, what its verdict on a fitted effect needs.
 _VALIDATION_FIELDS = ("inside", "heldout", "heldout_sigma", "poses", "poses_sigma", "steadiness")
 
@@ -57,7 +59,15 @@ def _candidate_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return a row for each effect that was tested, then for each that lacks what it needs."""
     unknown = ("p_value", "rms_if_added", "heldout_rms_if_added", "left_out", "minimum_detectable")
     untested = [
-        {"effect": name, "posterior": 0.0, "observable": False, "parameters": {}, "aliases": [], "needs": list(needs)}
+        {
+            "effect": name,
+            "posterior": 0.0,
+            "observable": False,
+            "parameters": {},
+            "aliases": [],
+            "needs": list(needs),
+            "against": [],
+        }
         | dict.fromkeys(unknown)
         for name, needs in diagnosis.missing.items()
     ]
@@ -87,7 +97,19 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
         "shape_if_missed": candidate.shape,
         "aliases": [{"effect": name, "correlation": alike} for name, alike in candidate.aliases.items()],
         "tier": ranked.score.candidate.effect.tier,
+        "against": _rivals(diagnosis, ranked),
     }
+
+
+def _rivals(diagnosis: Diagnosis, ranked: Ranked) -> list[dict[str, Any]]:
+    """Return what was built against a candidate that the views can see, the likeliest first; nothing missing is one."""
+    if not ranked.score.observable:
+        return []
+    odds = {c.name: c.ranked.log_posterior for c in diagnosis.candidates if c.ranked.score.observable}
+    odds |= {law_of(law).words: law.log_posterior for law in diagnosis.laws}
+    odds["nothing"] = ranked.log_posterior - ranked.log_odds_over_nothing
+    others = sorted((log_posterior, what) for what, log_posterior in odds.items() if what != ranked.name)
+    return [{"what": what, "log_odds": ranked.log_posterior - other} for other, what in others[: -_RIVALS - 1 : -1]]
 
 
 def _parameters(score: Score) -> dict[str, Any]:
@@ -151,6 +173,7 @@ DIAGNOSIS = Document(
     Key("format", write=lambda d: FORMAT),
     Key("verdict", Kind({"enum": ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]})),
     Key("effects"),
+    Key("certain"),
     Key("plain", write=lambda d: plain_finding(d, d.linear.measurement.length_unit)),
     Key("sentence"),
     Key("residual_rms"),

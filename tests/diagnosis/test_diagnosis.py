@@ -122,6 +122,19 @@ def test_document_has_no_infinite_number(nothing_hidden):
     assert json.loads(text)["verdict"] == "adequate"
 
 
+def test_what_stands_against_a_candidate_is_as_likely_as_the_posteriors_say(nothing_hidden):
+    document = json.loads(to_json(diagnosis_document(nothing_hidden[1])))
+    seen = {row["effect"]: row["posterior"] for row in document["candidates"] if row["observable"]}
+    for row in document["candidates"]:
+        rivals = {rival["what"]: rival["log_odds"] for rival in row["against"]}
+        assert row["effect"] not in rivals and list(rivals.values()) == sorted(rivals.values())
+        assert len(rivals) == (5 if row["observable"] else 0)
+        for what in rivals.keys() & {name for name, posterior in seen.items() if posterior > 1e-12}:
+            assert rivals[what] == pytest.approx(np.log(row["posterior"] / seen[what]), abs=1e-6)
+    # Nothing is the likeliest here, and no name holds perhaps only.
+    assert document["certain"] is True and document["candidates"][0]["against"][0]["what"] == "nothing"
+
+
 def test_a_hidden_joint_offset_is_named_and_found():
     offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
     session, *_ = labelled_cell(2, views=40, offset=offset)
