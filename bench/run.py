@@ -61,6 +61,7 @@ TABLES = {
     "real-scans": "hand_eye_sigmas:REAL_SCANS",
     "results": "results:TABLE",
     "scanner-laws": "foreign_laws:SCANNER",
+    "scanners": "scanners:TABLE",
     "stock": "stock:TABLE",
     "sweeps": "points:SWEEPS",
     "turning": "real_arms:TURNING",

@@ -12,6 +12,7 @@ from stitch.model.axis_places import AxisPlace, axis_places
 from stitch.model.model import Model, Term
 from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
+from stitch.observations.scanner_places import ScannerAlone, ScannerPlace, scanner_places
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.targets.outliers import Outlier
@@ -216,6 +217,7 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
     left_out: tuple[ExcludedView, ...] = ()  # views of the session that are not fused
     links: ViewLinks = field(default_factory=ViewLinks)
+    alone: tuple[ScannerAlone, ...] = ()  # of several scanners, each by its own views
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted and dropped again, and why
     hand_eye_transfer: HandEyeTransfer | None = field(default=None, compare=False)  # of a given one; not stored
 
@@ -270,6 +272,11 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
     def axes(self) -> tuple[AxisPlace, ...]:
         """Where the external axes stand, with sigma."""
         return axis_places(self.measurement, self.model)
+
+    @cached_property
+    def scanners(self) -> tuple[ScannerPlace, ...]:
+        """Where several scanners stand, with U; none of one."""
+        return scanner_places(self.measurement, self.model, self.alone)
 
     # Fields of `fit`.
 

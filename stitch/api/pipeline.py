@@ -17,16 +17,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stitch.effects.contract import find_effect, parameters_in, require_available
-from stitch.errors import InputError
+from stitch.errors import InputError, NoResultError
 from stitch.fit.coarse import COARSE_GATE, REUSED, CoarseHandEye
 from stitch.fit.coarse_axes import locate_axes
+from stitch.fit.correct import Correction
 from stitch.fit.fit import FitStart, FittedRig, InitialModel
 from stitch.fit.pipelines import coarse_stage, pipeline_for
 from stitch.fit.sentences import view_notes
 from stitch.fusion.register import DEFAULT, method_named
-from stitch.model.model_toml import ModelFile, arm_model, convert_unit, with_model_axes, without_events
+from stitch.model.model_toml import (
+    ModelFile,
+    arm_model,
+    convert_unit,
+    with_model_axes,
+    with_model_scanners,
+    without_events,
+)
 from stitch.numerics.frames import Array
 from stitch.observations.observability import unknown_numbers, unobservable
+from stitch.observations.scanner_places import ScannerAlone, contradictions
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import Fit, LedgerStep, RunData, StageResult
 from stitch.screening.deep_check import refuse_explained_mistake
@@ -38,6 +47,7 @@ from stitch.session.axis_poses import axis_tables
 from stitch.session.capture import Capture, part_size, prepare_capture
 from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 from stitch.session.notes import session_notes
+from stitch.session.scanners import join_sessions
 from stitch.session.session import SessionData
 from stitch.system.threads import Clock, begin, library_threads_off
 
@@ -122,6 +132,7 @@ def run_rig(
                 screened = check(screened, effects, model)
             notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
             fits = conductor.finish()
+        alone = () if model else _each_alone(screened.sessions[0], arm)
         runs = []
         for i, screening in enumerate(screened.screenings):
             order = sessions[i].names
@@ -129,10 +140,71 @@ def run_rig(
             screening = replace(screening, left_out=left_out, doubts=(*doubts, *screening.doubts))
             session = screened.sessions[i]
             run = _assemble_run(session, i, screened.fitted, hand_eyes[i], fits[i], screening, keep=keep, notes=notes)
-            runs.append(replace(run, effects_file=model.effects_file if model else None))
+            runs.append(_with_alone(replace(run, effects_file=model.effects_file if model else None), alone))
         for run, recorder in zip(runs, recorders, strict=True):
             recorder.finish(run)
         return runs
+
+
+def join_scanners(
+    sessions: Sequence[SessionData],
+    model: ModelFile | None = None,
+    arm: ModelFile | None = None,
+    captures: Sequence[Future[Capture]] | None = None,
+) -> SessionData:
+    """Return sessions of several scanners in one cell as one, each scanner where its own views put it, or a model.
+
+    Raises:
+        InputError: they share no arm, no unit, no axes or no mount; or a model of other scanners.
+        NoResultError: a scanner's own views say nothing of it, and nobody states where it stands.
+    """
+    require_same_rig(sessions, model)
+    require_measured_once(sessions)
+    for session in sessions[1:]:
+        _require_same_arm(sessions[0], session)
+    if model:
+        return join_sessions(with_model_scanners(sessions, convert_unit(model, sessions[0].length_unit)))
+    with library_threads_off():
+        prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
+        measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
+        if sessions[0].axes:
+            sessions, measurements = locate_axes(sessions, measurements)
+        placed = []
+        for session, measurement in zip(sessions, measurements, strict=True):
+            try:
+                T_mount = _fit_alone(session, measurement, arm).geometry.T_mount
+            except NoResultError as error:
+                if session.scanner.T_mount is None:
+                    raise NoResultError(f"scanner {session.scanner.name} alone: {error}") from None
+                T_mount = session.scanner.T_mount
+            placed.append(replace(session, scanner=replace(session.scanner, T_mount=T_mount)))
+        return join_sessions(placed)
+
+
+def _fit_alone(session: SessionData, measurement: Measurement, arm: ModelFile | None) -> Correction:
+    """Return what the views of one scanner say by themselves."""
+    steps = pipeline_for(session)
+    hand_eyes = steps.start([session], [measurement], None)
+    measurement = with_part_origin(measurement, hand_eyes[0].T_mount)
+    start = FitStart(hand_eyes, _initial_model(session, (), arm))
+    correction = steps.fit([session], [measurement], start, SilentRecorder()).correction
+    assert correction is not None
+    return correction
+
+
+def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlone, ...]:
+    """Return the hand-eyes of several scanners, each by those of its own views that count; none of one scanner."""
+    found = []
+    for k, whole in enumerate(session.parts):
+        name = whole.scanner.name
+        counted = {view.name.removesuffix(f"@{name}") for view in session.views if view.scanner == k}
+        own = whole.without(set(whole.names) - counted)
+        try:
+            model = _fit_alone(own, measurement_of(own, prepare_capture(own)), arm).model
+        except NoResultError:
+            continue
+        found.append(ScannerAlone(name, model.T_mount, model.covariance))
+    return tuple(found)
 
 
 def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
@@ -242,7 +314,7 @@ def _show_coarse_stage(
 
 def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile | None) -> InitialModel | None:
     """Return what gives the model from which effects beside another run's arm are fitted; None without any."""
-    if not effects and not arm and not session.axes:
+    if not effects and not arm and not session.axes and not session.parts:
         return None
     from stitch.diagnosis.score import start_with_effects
 
@@ -389,6 +461,8 @@ def _sigma_anywhere(fitted: FittedRig, index: int) -> Array | None:
     if correction is None:
         return None
     measurement = replace(fitted.sessions[index].measurement, capture=correction.captures[index])
+    if measurement.views.scanners:
+        return None
     unconstrained = correction.unconstrained[index]
     return hand_eye_sigma_anywhere(measurement, fitted.model_of(index), unconstrained, correction.scatter[index])
 
@@ -451,6 +525,15 @@ def _assemble_run(
     )
 
 
+def _with_alone(run: RunData, alone: tuple[ScannerAlone, ...]) -> RunData:
+    """Return the run of several scanners with what each says by itself, and whether they agree; another as it is."""
+    if not run.session.parts:
+        return run
+    run = replace(run, alone=alone)
+    doubts = contradictions(run.scanners, run.session.length_unit)
+    return replace(run, doubts=(*run.doubts, *doubts))
+
+
 def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
     """Fit a run again with these effects in its model: matches, hand-eye and all effects.
 
@@ -482,6 +565,7 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
         run = _assemble_run(session, 0, fitted, hand_eye, finished, screening)
         run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
+        run = _with_alone(run, state.alone)
         recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}
         return replace(run, tried=tried)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from stitch.api import pipeline, stepwise
+from stitch.api.pipeline import join_scanners
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
@@ -27,6 +28,7 @@ from stitch.output.result_document import model_of
 from stitch.output.run_folder import call_entry_points
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
+from stitch.session.scanners import have_own_hand_eyes
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
@@ -35,7 +37,7 @@ Register = Literal["dpwvm", "gicp", "vmm"]
 
 
 def run(
-    session: SessionData,
+    session: SessionData | Sequence[SessionData],
     model: ModelFile | RunData | None = None,
     recorder: Recorder | None = None,
     effects: Sequence[str] = (),
@@ -47,6 +49,8 @@ def run(
     """Stitch one session: correct the hand-eye from the scans, register, fuse.
 
     Args:
+        session: or a list of sessions of several scanners in one cell, each with a name of its own: one run, with a
+            hand-eye a scanner in `scanners`.
         model: a run, or a model that was read, whose hand-eye and effects are used as they are.
         recorder: is told of every stage.
         effects: names of effects to fit together with the hand-eye.
@@ -69,7 +73,16 @@ def run(
         (4, 4)
     """
     others = None if recorder is None else [recorder]
-    return run_rig([session], model, others, effects, keep, arm, register, progress)[0]
+    sessions = [session] if isinstance(session, SessionData | str | Path) else session
+    if isinstance(sessions, Sequence) and len(sessions) > 1:
+        _require_sessions(sessions)
+        if not have_own_hand_eyes(sessions):
+            raise InputError(
+                "stitch.run: several sessions of one scanner, or of scanners without names; to fix: stitch.run_rig for "
+                'one scanner, or [scanner] name = "left" in each session.toml'
+            )
+        sessions = [join_scanners(sessions, *_models(model, arm))]
+    return run_rig(sessions, model, others, effects, keep, arm, register, progress)[0]
 
 
 def run_rig(
@@ -103,8 +116,7 @@ def run_rig(
     _require_sessions(sessions)
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
     replays = [ReplayRecorder(other, progress) for other in others]
-    kept_arm = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
-    known_model = None if model is None else _model(model)
+    known_model, kept_arm = _models(model, arm)
     known_effects = [find_effect(name).name for name in _names(effects)]
     runs = pipeline.run_rig(sessions, known_model, replays, known_effects, keep, kept_arm, register=register)
     return [
@@ -312,6 +324,14 @@ def _names(effects: Sequence[str]) -> Sequence[str]:
     if isinstance(effects, str):
         raise InputError(f"effects: {effects!r} is a text, and a list is asked for; to fix: pass [{effects!r}]")
     return effects
+
+
+def _models(
+    model: ModelFile | RunData | None, arm: ModelFile | RunData | None
+) -> tuple[ModelFile | None, ModelFile | None]:
+    """Return the model that is used as it is, and the arm that is kept."""
+    kept = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
+    return None if model is None else _model(model), kept
 
 
 def _model(model: ModelFile | RunData) -> ModelFile:

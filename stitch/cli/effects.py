@@ -91,6 +91,7 @@ def _show_effect(effect: Effect) -> None:
         "twist": ", a twist: rx … tz",
         "rotary": ", one or more a rotary axis",
         "linear": ", one or more a linear axis",
+        "scanner": ", three a scanner but the first",
     }
     lines = [f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", f"  {effect.formula}"]
     for key, spec in effect.specs.items():

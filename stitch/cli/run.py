@@ -122,14 +122,16 @@ def run(
 
     # A second of libraries is still to be loaded, which takes one core.
     captures = [begin(partial(prepare_capture, session)) for session in loaded]
-    from stitch.api.pipeline import run_rig
+    from stitch.api.pipeline import join_scanners, run_rig
     from stitch.fusion.register import DEFAULT
     from stitch.output import json_file, run_folder
     from stitch.output.result_document import result_document
+    from stitch.session.scanners import have_own_hand_eyes
 
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
-    inner = [""] if len(loaded) == 1 else [session.name for session in loaded]
+    several = have_own_hand_eyes(loaded)
+    inner = [""] if len(loaded) == 1 or several else [session.name for session in loaded]
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
     run_folder.preload_entry_points("stitch.reports")
     with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
@@ -137,7 +139,12 @@ def run(
         for folder in folders:
             folder.mkdir(exist_ok=True)  # recordings are written while the run goes on
         recorders = [recorder_for(folder, recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=register or DEFAULT, captures=captures)
+        method = register or DEFAULT
+        if several:
+            joined = join_scanners(loaded, model, kept, captures)
+            runs = run_rig([joined], model, recorders, named, keep, arm=kept, register=method)
+        else:
+            runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=method, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         with ThreadPoolExecutor(1) as beside:
             written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)

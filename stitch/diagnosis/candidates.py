@@ -13,6 +13,7 @@ from stitch.effects.contract import (
     by_joint,
     is_asked,
     missing_need,
+    of_each_scanner,
     one_by_one,
     parameters_in,
     without_offset,
@@ -91,10 +92,12 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
     lack."""
     in_use = [term.name for term in linear.model.terms]
     # What holds still is asked nothing, and of axes nobody is told who has none.
-    library = [e for e in EFFECTS.values() if e.name not in in_use and is_asked(linear.measurement, e)]
+    views = linear.measurement.views
+    library = of_each_scanner(views, EFFECTS.values())
+    library = [e for e in library if e.name not in in_use and is_asked(linear.measurement, e)]
     missing = {e.name: needs for e in library if (needs := missing_need(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
-    shapes = empirical_effects(linear.measurement.views) if empirical else []
+    shapes = of_each_scanner(views, empirical_effects(views)) if empirical else []
     effects += [e for e in shapes if not missing_need(linear.measurement, e)]
     terms_of = [_grid_terms(linear, effect) for effect in effects]
     responses = iter(linear.responses([term for terms in terms_of for term in terms]))

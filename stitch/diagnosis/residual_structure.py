@@ -125,7 +125,7 @@ def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingErro
         repeating: what poses do again without a name; both are over scatter and what an arm usually errs by.
     """
     best = next(iter(empirical), None)
-    if best is None or best.name != FIELD or best.adjusted >= ALPHA_UNKNOWN:
+    if best is None or best.name.partition("@")[0] != FIELD or best.adjusted >= ALPHA_UNKNOWN:
         return False
     others = [r.score.log_bayes_factor for r in empirical[1:2]] + [error.log_bayes_factor for error in repeating]
     return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)

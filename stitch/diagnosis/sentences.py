@@ -76,7 +76,7 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     if pair:
         yield f"{pair[1].name} seems to be missing too ({fitted_amounts(pair[1])})."
         yield "Both sizes hold for a model with both effects."
-    if _SCALE in (candidate.name, pair[1].name if pair else ""):
+    if _SCALE in (candidate.name.partition("@")[0], pair[1].name.partition("@")[0] if pair else ""):
         # Scans, hand-eye and ways of the arm, all longer by the same share, fit each other as before.
         yield "These views cannot tell it from arm lengths that are all off by the same share; a known length can."
     if d.beyond_belief:
@@ -85,7 +85,8 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
 
 def _what_looks_the_same(d: Diagnosis, name: str) -> str:
     """Say which other place would move whole views as an effect does; nothing where there is none."""
-    place = EFFECTS[name].place if name in EFFECTS else ""
+    of_all = name.partition("@")[0]
+    place = EFFECTS[of_all].place if of_all in EFFECTS else ""
     if place not in ("mount", "part") or d.linear.measurement.eye_to_hand != (place == "mount"):
         return ""
     stands = "the scanner's stand" if place == "mount" else "what holds the part"

@@ -1,4 +1,4 @@
-"""External axes: where they truly stand, which every model of a session with axes fits, and what goes wrong with them.
+"""Where external axes and further scanners truly stand, which every model fits; what goes wrong with axes.
 
 Effects change an `AxisMotion`: readings, placement, how a carriage turns along its way, a twist beside the axis' own
 motion. Twists are those of the axis' frame, z along the axis, before it has moved. What turns with a table once is a
@@ -10,14 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.effects.contract import effect, per_axis
+from stitch.effects.contract import effect, per_axis, per_scanner
 from stitch.numerics.frames import Array, Mask
 from stitch.session.axes import AxisMotion
 from stitch.session.measurement import Views
 
 # Sides of an axis' frame across it.
 _ACROSS = ("u", "v")
-PLACEMENT = "axis_placement"
+PLACEMENT, SCANNER_PLACEMENT = "axis_placement", "scanner_placement"
 
 
 @effect(
@@ -36,6 +36,19 @@ def axis_placement(motion: AxisMotion, views: Views, tilt: Array, shift: Array, 
     placement[rotary, 3:5] += shift.reshape(-1, 2)
     placement[~rotary, :2] += turn.reshape(-1, 2)
     return replace(motion, placement=placement)
+
+
+@effect(
+    "mount",
+    needs=("scanners",),
+    tier="geometry",
+    r=per_scanner("rad", 0.005, 0.5),
+    t=per_scanner("mm", 5.0, 500.0),
+)
+def scanner_placement(views: Views, r: Array, t: Array) -> Array:
+    """every scanner but the first truly at its own hand-eye times exp(r, t)"""
+    twists = np.column_stack([r.reshape(-1, 3), t.reshape(-1, 3)])
+    return np.vstack([np.zeros(6), twists])[views.scanners.of_view]
 
 
 @effect("axis", needs=("rotary_axis",), A=per_axis("rotary", "mm", 0.05, 2.0), B=per_axis("rotary", "mm", 0.05, 2.0))

@@ -9,7 +9,7 @@ The function says what nature does; that it must be undone, its Jacobian, its te
 themselves. What a function receives and returns depends on the place, `PLACES`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from stitch.errors import InputError, did_you_mean
 from stitch.numerics.units import Amount, format_amount
 from stitch.session.axes import KINDS, Axis
-from stitch.session.measurement import TEMPERATURES, Measurement
+from stitch.session.measurement import TEMPERATURES, Measurement, Views
 
 # Usual sizes beyond which something that is stated is likelier to be wrong than a parameter so large (custom).
 BELIEVABLE_SIZES = 10.0
@@ -55,6 +55,7 @@ _WHERE_FROM = {
     "axis": "an external axis ([[axis]] in session.toml)",
     "rotary_axis": "a rotary axis ([[axis]] in session.toml)",
     "linear_axis": "a linear axis ([[axis]] in session.toml)",
+    "scanners": "sessions of several scanners ([scanner] name in session.toml)",
     "gravity_at_mount": "a scanner that the robot turns against gravity",
     "gravity_at_part": "a part that the robot turns against gravity",
 }
@@ -64,7 +65,7 @@ _WHERE_FROM = {
 class Spec:
     """How an argument of the function becomes parameters."""
 
-    kind: str  # number | vector | offset | joint | torque | moment | twist | rotary | linear
+    kind: str  # number | vector | offset | joint | torque | moment | twist | rotary | linear | scanner
     unit: str
     typical: float
     limit: float
@@ -115,6 +116,11 @@ def per_torque(unit: str, typical: float, limit: float) -> Spec:
 def per_axis(kind: str, unit: str, typical: float, limit: float, axes: Sequence[str] = ("",)) -> Spec:
     """Return an array (K·a,) with a numbers for each of the K external axes of a kind, rotary or linear: Au_table."""
     return Spec(kind, unit, typical, limit, axes=tuple(axes))
+
+
+def per_scanner(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
+    """Return an array (3·(K − 1),) with a vector for each of K scanners but the first: rx_right."""
+    return Spec("scanner", unit, typical, limit, axes=tuple(axes))
 
 
 def per_moment(unit: str, typical: float, limit: float) -> Spec:
@@ -208,11 +214,18 @@ class Effect:
     group: str = ""  # covariate that an empirical effect follows
     prior: float = 1.0  # how often it is met, beside an effect that every arm, mount or part may have
     origin: str = ""  # of a user's: the file that it was loaded from, or `package …`; empty for one of this program
+    scanner: str = ""  # of several the one that has it, as its name says after an @; empty: all
 
     @property
     def formula(self) -> str:
         """The first line of the function's docstring."""
-        return (self.function.__doc__ or "").strip().splitlines()[0]
+        function = getattr(self.function, "of_all", self.function)
+        return (function.__doc__ or "").strip().splitlines()[0]
+
+    def at_scanner(self, scanner: str) -> "Effect":
+        """Return the same effect of one scanner among several, named EFFECT@SCANNER."""
+        function = _AtScanner(self.function, self.place, scanner)
+        return replace(self, name=f"{self.name}@{scanner}", function=function, scanner=scanner)
 
     def parameters(
         self,
@@ -221,19 +234,23 @@ class Effect:
         length_unit: str,
         axes: Sequence[Axis] = (),
         moments: Sequence[str] = (),
+        scanners: Sequence[str] = (),
     ) -> tuple[Parameter, ...]:
         """Return all parameters for an arm of n joints at zero, in the session's unit.
 
         Args:
             torques: names of those that bend its joints.
             moments: names of those that tilt its base.
+            scanners: names of all.
         """
+        # The first scanner's place is the hand-eye.
+        things = {kind: [axis.name for axis in axes if axis.kind == kind] for kind in KINDS} | {"scanner": scanners[1:]}
         named = [
             (key, spec, name)
             for key, spec in self.specs.items()
             for name in (
-                [f"{key}{part}_{axis.name}" for axis in axes if axis.kind == spec.kind for part in spec.axes]
-                if spec.kind in KINDS
+                [f"{key}{part}_{thing}" for thing in things[spec.kind] for part in spec.axes]
+                if spec.kind in things
                 else _parameter_names(key, spec, joints, moments if spec.kind == "moment" else torques)
             )
         ]
@@ -274,6 +291,26 @@ def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
     above, _, below = unit.partition("/")
     factor = _PER_MM[length_unit] ** ((above == "mm") - (below == "mm"))
     return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, spec.grid, argument=key)
+
+
+@dataclass(frozen=True)
+class _AtScanner:
+    """The function of an effect in the views of one scanner; elsewhere it does nothing."""
+
+    of_all: Callable[..., Any]
+    place: str
+    scanner: str
+
+    def __call__(self, known: Any, view: Any = None, **arguments: Any) -> Any:
+        """Return what the place asks for: of `known` views twists, or points of one view."""
+        views = known if self.place == "mount" else view.views
+        own = views.scanners.names.index(self.scanner)
+        has_it = views.scanners.of_view == own
+        if self.place == "mount":
+            return has_it[:, None] * self.of_all(views.by_scanner[own], **arguments)
+        return (
+            self.of_all(known, replace(view, views=views.by_scanner[own]), **arguments) if has_it[view.index] else known
+        )
 
 
 EFFECTS: dict[str, Effect] = {}
@@ -329,6 +366,9 @@ def find_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
+    of_all, _, scanner = name.partition("@")
+    if scanner and of_all in EFFECTS:
+        return EFFECTS[of_all].at_scanner(scanner)
     if name not in EFFECTS:
         there = f"one of {', '.join(EFFECTS)}"
         raise InputError(
@@ -337,6 +377,20 @@ def find_effect(name: str) -> Effect:
             fix_python=f"{there}; your own: import the file that defines it",
         )
     return EFFECTS[name]
+
+
+def of_each_scanner(views: Views, effects: Iterable[Effect]) -> list[Effect]:
+    """Return effects; of several scanners, what one may have by itself for each of them."""
+    names = views.scanners.names
+    return [
+        each
+        for effect in effects
+        for each in (
+            [effect.at_scanner(name) for name in names]
+            if names and effect.place in ("sensor", "mount") and effect.tier != "geometry"
+            else [effect]
+        )
+    ]
 
 
 def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, ...]:
@@ -365,6 +419,7 @@ def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, 
             measurement.length_unit,
             views.axes.axes,
             views.torques.base_names,
+            views.scanners.names,
         )
     )
 
@@ -378,6 +433,8 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
         "surfaces": measurement.has_surfaces,
     }
     missing = [need for need in effect.needs if not known_here.get(need, views.has(need))]
+    if effect.scanner and effect.scanner not in views.scanners.names:
+        missing.append(f"scanner {effect.scanner}")
     if effect.prefers and not any(views.has(name) for name in (*effect.prefers, "time")):
         missing.append("time")
     return tuple(missing)
@@ -412,7 +469,7 @@ def require_available(measurement: Measurement, effect: Effect) -> None:
 
 def describe_need(need: str) -> str:
     """Return what an effect needs, as somebody who writes a session knows it."""
-    return _WHERE_FROM.get(need, f"a column {need} in views.csv")
+    return need if need.startswith("scanner ") else _WHERE_FROM.get(need, f"a column {need} in views.csv")
 
 
 def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:

@@ -39,7 +39,7 @@ from stitch.system.process import steps
 from stitch.system.threads import parallel
 
 # Where a hand-eye came from that was not searched.
-STATED, REUSED = "given in session.toml", "of another run, used as it is"
+STATED, REUSED, ALONE = "given in session.toml", "of another run, used as it is", "of each scanner's own views"
 # First gate of the search and truncation of the score, as shares of the part's size.
 COARSE_GATE, SCORE_SHARE = 0.35, 0.05
 # Points of a view that are asked for their nearest neighbours while a hand-eye is searched.

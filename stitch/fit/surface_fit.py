@@ -124,8 +124,16 @@ class LinearisedSurfaces:
         """Return the parameters that the views ask for, those of before first, and what errs beside them."""
         # What the scanner repeats hardly changes with the last micrometres.
         scanner_errors = rig_scanner_errors(self.measurements, self.unconstrained)
-        if _SCALE in [term.name for term in self.model.terms]:
+        # The effect of one scanner among several takes the place of that one's column.
+        of_scale = [term.effect for term in self.model.terms if term.name.partition("@")[0] == _SCALE]
+        if any(not effect.scanner for effect in of_scale):
             del scanner_errors[SCANNER_SCALE]
+        elif of_scale:
+            of_each = zip(self.measurements, scanner_errors[SCANNER_SCALE], strict=True)
+            named = {effect.scanner for effect in of_scale}
+            scanner_errors[SCANNER_SCALE] = [
+                scale[:, [name not in named for name in m.views.scanners.names]] for m, scale in of_each
+            ]
         held = self._held
         fitted = np.zeros(len(held), bool) if before is None else before[0]
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
@@ -179,7 +187,14 @@ class LinearisedSurfaces:
     def _is_gauge(self) -> Mask:
         """(P,) places of axes where no robot says how their common frame stands: what is not fitted is free."""
         is_free = any(m.views.axes and not m.views.axes.has_robot for m in self.measurements)
-        return np.array([is_free and term.is_geometry for term in self.model.terms for _ in term.parameters], bool)
+        return np.array(
+            [
+                is_free and term.effect.place == "axis" and term.is_geometry
+                for term in self.model.terms
+                for _ in term.parameters
+            ],
+            bool,
+        )
 
     @property
     def _held(self) -> Mask:

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from stitch.fit.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
+from stitch.fit.coarse import ALONE, REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.fit.correct import Correction, apply_given_hand_eye, correct
 from stitch.fit.fit import FitStart, FittedRig, fit_without_outliers
 from stitch.fit.sentences import correct_note, mixed_notes, register_note, support_note, surface_sentence, warnings
@@ -50,7 +50,7 @@ def start(
     if file:
         hand_eye = use_given_hand_eye(captures, file.T_mount, REUSED)
     elif stated is not None:
-        hand_eye = use_given_hand_eye(captures, stated, STATED)
+        hand_eye = use_given_hand_eye(captures, stated, ALONE if sessions[0].parts else STATED)
     else:
         hand_eye = find_coarse_hand_eye(captures)
     return [hand_eye] * len(sessions)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stitch.effects.axis_effects import PLACEMENT
 from stitch.model.forward import chain_errors
 from stitch.model.model import Model, Term, values_of
 from stitch.numerics import frames
@@ -63,7 +64,7 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
     axes = measurement.views.axes
     if not axes:
         return ()
-    term = next((term for term in model.terms if term.is_geometry), None)
+    term = next((term for term in model.terms if term.name == PLACEMENT), None)
     near = _middle(measurement, model)
     names = [] if term is None else [f"{term.name}.{p.name}" for p in term.parameters]
     steps, covariance = _joint_covariance(model, names)

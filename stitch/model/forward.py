@@ -80,7 +80,8 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
     if errors.axes is not None and any(term.effect.place == "axis" for term in terms):
         T_base_flange = measurement.views.axes.correction(errors.axes) @ T_base_flange
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
-    return frames.exp(-errors.part) @ left, frames.exp(errors.mount)
+    right, behind = frames.exp(errors.mount), measurement.views.scanners.behind
+    return frames.exp(-errors.part) @ left, right if behind is None else behind @ right
 
 
 def _under_base(measurement: Measurement) -> Array:
@@ -326,7 +327,9 @@ class _ChainJacobian:
     @cached_property
     def of_mount(self) -> Array:
         """(V, 6, 6) for changes of the twist of the mount: exp(m + δ) = exp(J δ)·exp(m)."""
-        return frames.adjoint(self._left @ self.about.T_mount) @ frames.left_jacobian(self.errors.mount)
+        behind = self.measurement.views.scanners.behind
+        T_mount = self.about.T_mount if behind is None else self.about.T_mount @ behind
+        return frames.adjoint(self._left @ T_mount) @ frames.left_jacobian(self.errors.mount)
 
     @cached_property
     def of_part(self) -> Array:

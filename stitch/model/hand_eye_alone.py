@@ -34,8 +34,10 @@ def hand_eye_alone(measurement: Measurement, model: Model) -> HandEyeAlone | Non
 
     What began at a view counts as it was in the end.
     """
-    terms = _as_in_the_end([term for term in model.terms if term.effect.place in (*ARM_PLACES, "mount")])
-    if not terms:
+    places = (*ARM_PLACES, "mount")
+    terms = _as_in_the_end([term for term in model.terms if term.effect.place in places and not term.is_geometry])
+    # Several scanners have no hand-eye in common.
+    if not terms or measurement.views.scanners:
         return None
     left, right = perturbed_frames(measurement, terms)
     plain, _ = perturbed_frames(measurement, ())

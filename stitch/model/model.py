@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.effects.axis_effects import PLACEMENT
+from stitch.effects.axis_effects import PLACEMENT, SCANNER_PLACEMENT
 from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in
 from stitch.numerics import frames
 from stitch.numerics.distributions import sigmas_among
@@ -200,15 +200,17 @@ class Model(Value):
 
 
 def geometry_terms(measurement: Measurement) -> tuple[Term, ...]:
-    """Return what every model of a session fits beside the hand-eye, at zero: where its axes stand."""
+    """Return what every model of a session fits beside the hand-eye, at zero: where its axes and
+    further scanners stand."""
     axes = measurement.views.axes
+    scanners = (term_of(measurement, find_effect(SCANNER_PLACEMENT)),) if measurement.views.scanners else ()
     if not axes:
-        return ()
+        return scanners
     term = term_of(measurement, find_effect(PLACEMENT))
     still = {axis.name for k, axis in enumerate(axes.axes) if axis.is_fixed or k == axes.own}
     # One that is used as given is held as what another run knows is.
     parameters = [replace(p, kept=p.name.partition("_")[2] in still) for p in term.parameters]
-    return (Term(term.effect, tuple(parameters)),)
+    return (Term(term.effect, tuple(parameters)), *scanners)
 
 
 def term_of(measurement: Measurement, effect: Effect) -> Term:

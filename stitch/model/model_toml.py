@@ -5,7 +5,7 @@ what happened at one view of a session; `keep_arm_effects` takes nothing but the
 joints and links as they are, under another mount, tool or day.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -55,6 +55,7 @@ class ModelFile(Value):
     targets: dict[str, Target] = field(default_factory=dict)  # of a session with labelled points
     effects_covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # stands in result.json
     axes: dict[str, tuple[Array, Array | None]] = field(default_factory=dict)  # direction and point before placement
+    scanners: dict[str, Array] = field(default_factory=dict)  # (4, 4) hand-eye of each of several before placement
 
 
 def write_model(model: ModelFile, path: Path) -> None:
@@ -86,6 +87,9 @@ def write_model(model: ModelFile, path: Path) -> None:
             name: {"direction": direction.tolist(), **({} if point is None else {"point": point.tolist()})}
             for name, (direction, point) in model.axes.items()
         }
+    if model.scanners:
+        # Likewise for scanner_placement; hand_eye is that of the first.
+        document["scanners"] = {name: {"hand_eye": T.tolist()} for name, T in model.scanners.items()}
     if model.effects_file:
         document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
@@ -142,6 +146,10 @@ def read_model(path: Path | str) -> ModelFile:
         effects_file=optional_text(path, document, "", "effects_file"),
         targets=_targets(path, document.get("targets", {})),
         axes=_axes(path, document.get("axes", {})),
+        scanners={
+            str(name): _matrix(path, table if isinstance(table, dict) else {}, "hand_eye", 4)
+            for name, table in document.get("scanners", {}).items()
+        },
     )
 
 
@@ -182,6 +190,23 @@ def with_model_axes(session: SessionData, file: ModelFile) -> SessionData:
     return place_axes(
         session, [replace(a, direction=file.axes[a.name][0], point=file.axes[a.name][1]) for a in session.axes]
     )
+
+
+def with_model_scanners(sessions: Sequence[SessionData], file: ModelFile) -> list[SessionData]:
+    """Return the sessions of several scanners with each where a model's placement counts from.
+
+    Raises:
+        InputError: a scanner that the model does not know.
+    """
+    unknown = [session for session in sessions if session.scanner.name not in file.scanners]
+    if unknown:
+        raise InputError(
+            f"{unknown[0].path}: scanner {unknown[0].scanner.name!r} is none of the model's, "
+            f"{', '.join(file.scanners) or 'which has one'}; to fix: name the run of the same scanners"
+        )
+    order = list(file.scanners)
+    ranked = sorted(sessions, key=lambda session: order.index(session.scanner.name))
+    return [replace(s, scanner=replace(s.scanner, T_mount=file.scanners[s.scanner.name])) for s in ranked]
 
 
 def _targets(path: Path, table: Any) -> dict[str, Target]:
@@ -349,6 +374,7 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
             with_hand_eye=known.with_hand_eye * np.outer(scale, beside[: known.with_hand_eye.shape[1]]),
         ),
         axes={name: (d, None if point is None else point * factor) for name, (d, point) in file.axes.items()},
+        scanners={name: frames.make(T[:3, :3], T[:3, 3] * factor) for name, T in file.scanners.items()},
         targets={
             name: Target(t.position * factor, t.sigma * factor, t.orientation) for name, t in file.targets.items()
         },

@@ -29,32 +29,46 @@ _PARALLEL = np.cos(np.radians(2.0))
 _TURNED = np.radians(0.5)
 
 
-def seen_part(captures: Sequence[Capture]) -> tuple[Array, float]:
-    """Return the centre (3,) of what the scanner saw, scanner frame, and the size of the part, length_unit."""
-    every = [points for c in captures for points in c.point_sets]
+def seen_part(captures: Sequence[Capture], scanner: int = 0) -> tuple[Array, float]:
+    """Return the centre (3,) of what a scanner saw, scanner frame, and the size of the part, length_unit."""
+    every = [points for c in captures for points in c.seen_by(scanner)]
     centre = np.asarray(np.mean([centroid(p) for p in every], axis=0))
     size = float(np.median([spread(p) for p in every]))
     # A probe is a point: a tenth of its distance stands in for its size.
     return centre, size or 0.1 * float(np.linalg.norm(centre))
 
 
-def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array, size: float) -> tuple[Array, Array]:
+def motion_gain(
+    captures: Sequence[Capture], T_mount: Array, centre: Array, size: float, scanner: int = 0
+) -> tuple[Array, Array]:
     """Return gains (6,) ascending and the directions (6, 6) as columns, twists about the part's centre.
+
+    Of several scanners the others move freely too: what all together may do and nothing shows has no gain.
 
     Args:
         centre, size: as `seen_part` has them; twists are taken about the centre, so that a rotation of the scanner is
             not mistaken for the translation that it causes at the part.
+        scanner: the one that moves, among several.
     """
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
-    total, views = np.zeros((6, 6)), 0
+    several = 1 + max((int(c.scanner.max()) for c in captures if c.scanner is not None), default=0)
+    total, views = np.zeros((6 * several, 6 * several)), 0
     for capture in captures:
         poses = capture.poses(T_mount) @ about
         to_part = frames.make(np.eye(3), -poses[:, :3, 3].mean(axis=0))
         response = np.linalg.inv(scale) @ frames.adjoint(to_part @ poses) @ scale
+        if capture.scanner is not None:
+            own = np.eye(several)[capture.scanner]
+            response = np.einsum("vij,vs->visj", response, own).reshape(len(poses), 6, -1)
         response = response - response.mean(axis=0)
         total += np.einsum("vij,vik->jk", response, response)
         views += len(poses)
+    if several > 1:
+        at = np.arange(6 * scanner, 6 * scanner + 6)
+        rest = np.setdiff1d(np.arange(len(total)), at)
+        taken = total[np.ix_(at, rest)] @ np.linalg.pinv(total[np.ix_(rest, rest)], rcond=1e-9, hermitian=True)
+        total = total[np.ix_(at, at)] - taken @ total[np.ix_(rest, at)]
     values, vectors = np.linalg.eigh(total / views)
     return np.sqrt(np.maximum(values, 0)), scale @ vectors
 
@@ -97,14 +111,15 @@ def hidden_translations(captures: Sequence[Capture], T_mount: Array) -> Array:
     return T_mount[:3, :3].T @ vectors[:, values < _VISIBLE**2]
 
 
-def unknown_numbers(captures: Sequence[Capture], T_mount: Array) -> tuple[str, ...]:
+def unknown_numbers(captures: Sequence[Capture], T_mount: Array, scanner: int = 0) -> tuple[str, ...]:
     """Return which of x, y, z, rx, ry, rz of the hand-eye the motions leave open.
 
     They are position and rotation vector in the frame that carries the scanner. A number is open where what is hidden
     changes it by more than a hundredth of what it does to the part.
     """
-    centre, size = seen_part(captures)
-    gains, directions = motion_gain(captures, T_mount, centre, size)
+    centre, size = seen_part(captures, scanner)
+    gains, directions = motion_gain(captures, T_mount, centre, size, scanner)
+    T_mount = _own_mount(captures, T_mount, scanner)
     at_scanner = frames.adjoint(frames.make(np.eye(3), centre)) @ directions[:, gains < _VISIBLE]
     moved = T_mount @ frames.exp(_SMALL * at_scanner.T)
     turned = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec() - Rotation.from_matrix(T_mount[:3, :3]).as_rotvec()
@@ -112,13 +127,24 @@ def unknown_numbers(captures: Sequence[Capture], T_mount: Array) -> tuple[str, .
     return tuple(np.array(NUMBERS)[np.linalg.norm(changes, axis=0) > _VISIBLE].tolist())
 
 
+def _own_mount(captures: Sequence[Capture], T_mount: Array, scanner: int) -> Array:
+    """Return the hand-eye (4, 4) of one of several scanners from that of the first."""
+    of_view, behind = captures[0].scanner, captures[0].T_behind_mount
+    return T_mount if of_view is None or behind is None else T_mount @ behind[of_view == scanner][0]
+
+
 def unobservable(
-    captures: Sequence[Capture], T_mount: Array, robot: Robot | None = None, joints: Array | None = None
+    captures: Sequence[Capture],
+    T_mount: Array,
+    robot: Robot | None = None,
+    joints: Array | None = None,
+    scanner: int = 0,
 ) -> tuple[str, ...]:
     """Return one phrase per direction of the hand-eye that these motions cannot show."""
-    gains, directions = motion_gain(captures, T_mount, *seen_part(captures))
+    gains, directions = motion_gain(captures, T_mount, *seen_part(captures, scanner), scanner)
     axes = _named_axes(captures, robot, joints)
     hidden = _split(directions[:, gains < _VISIBLE], _reach(captures, T_mount))
+    T_mount = _own_mount(captures, T_mount, scanner)
     return tuple(f"{kind} {_name(T_mount[:3, :3] @ direction, axes)}" for kind, direction in hidden)
 
 

@@ -33,7 +33,7 @@ _PICTURES = {
 
 def is_run_file(path: Path) -> Ours:
     """Return whether a path inside the run folder `path` was written by stitch."""
-    inner = set(runs_of_rig(path))
+    inner = set(_inner_runs(path))
 
     def is_ours(inside: Path) -> bool:
         if inside.parts[0] in inner:
@@ -54,7 +54,7 @@ def sessions_in(path: Path) -> list[str] | None:
     """Return paths of the sessions of a run folder as it states them; None for a folder that is no run."""
     if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
         return None
-    folders = (path, *(path / name for name in runs_of_rig(path)))
+    folders = (path, *(path / name for name in _inner_runs(path)))
     sessions = [_session_path(folder / "result.json") for folder in folders]
     return [session for session in sessions if session is not None] or None
 
@@ -102,7 +102,14 @@ def others_of_rig(run: Path) -> list[str]:
 
 def runs_of_rig(path: Path) -> list[str]:
     """Return names of the runs in the folder of a rig, which has no result of its own."""
-    if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():
+    return [] if (path / "result.json").exists() else _inner_runs(path)
+
+
+def _inner_runs(path: Path) -> list[str]:
+    """Return names of the runs in the folder of a rig, or of one run of several scanners."""
+    if not path.is_dir() or not (path / "model.toml").is_file():
+        return []
+    if (path / "result.json").exists() and "scanners" not in read_json_object(path / "result.json"):
         return []
     return sorted(file.parent.name for file in path.glob("*/result.json") if _session_path(file) is not None)
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stitch.effects.axis_effects import SCANNER_PLACEMENT
 from stitch.effects.contract import Effect, Parameter
 from stitch.effects.user_source import FILE, source_of
 from stitch.errors import InputError
@@ -17,6 +18,7 @@ from stitch.model.hand_eye_alone import HandEyeAlone, hand_eye_alone
 from stitch.model.model import EffectsCovariance, Target
 from stitch.model.model_toml import ModelFile
 from stitch.numerics.frames import Array
+from stitch.observations.scanner_places import ScannerAlone
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.targets.outliers import Outlier, mask_outliers
 from stitch.observations.targets.target_model import TargetModelFit
@@ -90,6 +92,7 @@ def model_of(run: RunData) -> ModelFile:
         targets=_targets(run.targets),
         effects_covariance=run.model.effects_covariance,
         axes={a.name: (a.direction, a.point) for a in run.session.axes if a.direction is not None},
+        scanners={p.scanner.name: p.scanner.T_mount for p in run.session.parts if p.scanner.T_mount is not None},
     )
 
 
@@ -313,6 +316,97 @@ def _axis_rows(run: RunData) -> list[dict[str, Any]]:
     return [{key: plain(value) for key, value in vars(place).items() if value is not None} for place in run.axes]
 
 
+def _session_paths(run: RunData) -> list[str]:
+    return [str(part.path.resolve()) for part in run.session.parts]
+
+
+def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
+    """Return where several scanners stand, and what the views of each say by themselves."""
+    parts = {part.scanner.name: part for part in run.session.parts}
+    return [
+        {
+            "scanner": place.name,
+            "session": parts[place.name].name,
+            "hand_eye": plain(place.T_mount),
+            "hand_eye_sigma": plain(place.sigma),
+            "hand_eye_covariance": plain(place.covariance),
+            "unobservable": list(place.unobservable),
+            "hand_eye_unknown": list(place.unknown),
+            "U": place.U,
+        }
+        | (
+            {}
+            if place.alone is None
+            else {
+                "alone": {
+                    "hand_eye": plain(place.alone.hand_eye),
+                    "hand_eye_covariance": plain(place.alone.covariance),
+                    "U": place.U_alone,
+                    "apart": place.apart,
+                }
+            }
+        )
+        for place in run.scanners
+    ]
+
+
+def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[dict[str, Any], ModelFile]]:
+    """Return result and model of each scanner among several by the name of its session: what another run of it needs.
+
+    Args:
+        whole: result.json of all.
+    """
+    common = model_of(run)
+    documents = {}
+    for k, (part, row) in enumerate(zip(run.session.parts, whole["scanners"], strict=True)):
+        name = part.scanner.name
+        mine = {
+            effect.removesuffix(f"@{name}"): parameters
+            for effect, parameters in common.effects.items()
+            if effect != SCANNER_PLACEMENT and effect.partition("@")[2] in ("", name)
+        }
+        place = run.scanners[k]
+        model = replace(
+            common,
+            T_mount=place.T_mount,
+            T_mount_coarse=place.T_mount if part.scanner.T_mount is None else part.scanner.T_mount,
+            covariance=place.covariance,
+            effects=mine,
+            effects_covariance=EffectsCovariance(),
+            scanners={},
+        )
+        own = {
+            "session": str(part.path.resolve()),
+            "name": part.name,
+            "hand_eye_coarse": plain(model.T_mount_coarse),
+            "effects": {e: {p: parameter_row(value) for p, value in table.items()} for e, table in mine.items()},
+            "hand_eye_stated": False,
+            **{key: value for key, value in row.items() if key not in ("session", "alone", "U")},
+            "views": _own_rows(whole["views"], name),
+            "left_out": _own_rows(whole["left_out"], name),
+            "linkage": {},
+            "stock": _own_rows(whole.get("stock", []), name),
+        }
+        left = ("sessions", "scanners", "effects_covariance", "hand_eye_sigma_anywhere")
+        documents[part.name] = ({k: v for k, v in whole.items() if k not in left} | own, model)
+    return documents
+
+
+def _own_rows(rows: list[dict[str, Any]], scanner: str) -> list[dict[str, Any]]:
+    """Return the rows of one scanner's views, under the names that its session has for them."""
+    own = [row for row in rows if row["view"].endswith(f"@{scanner}")]
+    return [row | {"view": row["view"].removesuffix(f"@{scanner}")} for row in own]
+
+
+def scanners_alone(document: dict[str, Any]) -> tuple[ScannerAlone, ...]:
+    """Return what a result says of each of several scanners by its own views."""
+    rows = [(row["scanner"], row["alone"]) for row in document.get("scanners", ()) if "alone" in row]
+    return tuple(
+        ScannerAlone(name, np.array(own["hand_eye"], float), np.array(own["hand_eye_covariance"], float))
+        for name, own in rows
+    )
+
+
 def _known_anywhere(run: RunData) -> bool:
     """Return whether the hand-eye's sigma anywhere the arm reaches is known."""
     return run.fit.sigma_anywhere is not None
@@ -410,6 +504,9 @@ _NUMBERS = Kind(list_of(NUMBER_OR_NULL).schema, read=lambda values: [number(valu
 RESULT = Document(
     Key("format", write=lambda run: FORMAT),
     Key("session", _PATH, write=lambda run: str(run.session.path.resolve())),
+    Key("sessions", list_of(_PATH), write=_session_paths, when=attrgetter("session.parts")),
+    Key("scanner", attribute="session.scanner.name", when=attrgetter("session.scanner.name")),
+    Key("scanners", write=_scanner_rows, when=attrgetter("session.parts")),
     Key("name", attribute="session.name"),
     Key("length_unit", attribute="session.length_unit"),
     Key("mount", attribute="session.mount"),
@@ -422,7 +519,7 @@ RESULT = Document(
     Key("hand_eye_alone", _ALONE.kind(), write=_hand_eye_alone, when=_hand_eye_alone),
     Key("unobservable", TEXTS, of=Fit),
     Key("hand_eye_unknown", TEXTS, "unknown", of=Fit, optional=True),
-    Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None and run.session.has_poses),
+    Key("hand_eye_stated", attribute="session.states_hand_eye"),
     Key("stages", _STAGE.rows(StageResult), of=Fit),
     Key("residual_rms", NUMBER, of=RunData),
     Key("heldout_rms", NUMBER_OR_NULL, of=RunData),

@@ -24,7 +24,14 @@ from stitch.model.model_toml import read_model, write_model
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import Match
 from stitch.output.json_file import FILES, FITS, is_run_file, require_free, write_json
-from stitch.output.result_document import effects_source, ledger, model_of, residual_columns, result_document
+from stitch.output.result_document import (
+    effects_source,
+    ledger,
+    model_of,
+    residual_columns,
+    result_document,
+    scanner_documents,
+)
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
@@ -204,10 +211,11 @@ def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
     None where the session or the model is not what was fitted, and for effects of a user's own file, which may change.
     """
     try:
-        session = Path(json.loads((path / "result.json").read_text(encoding="utf-8"))["session"])
+        document = json.loads((path / "result.json").read_text(encoding="utf-8"))
+        sessions = [Path(session) for session in document.get("sessions", [document["session"]])]
         fitted = (path / "result.json").stat().st_mtime_ns
         edited = (path / "model.toml").stat().st_mtime_ns
-        files = [(file.name, file.stat()) for file in measured_files(session)]
+        files = [(file.name, file.stat()) for session in sessions for file in measured_files(session)]
     except (OSError, ValueError, LookupError, csv.Error):
         return None
     marks = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in files]
@@ -287,10 +295,17 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
 
 
 def write_numbers(run: RunData, folder: Path) -> None:
-    """Write model.toml, result.json and ledger.json into `folder`."""
+    """Write model.toml, result.json and ledger.json into `folder`; of several scanners those of each beside."""
     write_model_with_effects(run, folder)
-    write_json(result_document(run), folder / "result.json")
-    write_json(ledger(run), folder / "ledger.json")
+    document = result_document(run)
+    steps = ledger(run)
+    write_json(document, folder / "result.json")
+    write_json(steps, folder / "ledger.json")
+    for name, (own, model) in scanner_documents(run, document).items() if run.session.parts else ():
+        (folder / name).mkdir(exist_ok=True)
+        write_json(own, folder / name / "result.json")
+        write_json(steps, folder / name / "ledger.json")
+        write_model(model, folder / name / "model.toml")
 
 
 def write_model_with_effects(run: RunData, folder: Path) -> None:

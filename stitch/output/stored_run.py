@@ -13,7 +13,7 @@ from stitch.fit.correct import converged_overlaps, gate_of_model
 from stitch.fit.target_fit import evaluate_targets
 from stitch.model.forward import corrected_capture
 from stitch.model.model import EffectsCovariance
-from stitch.model.model_toml import ModelFile, bind_to_session, read_model, with_model_axes
+from stitch.model.model_toml import ModelFile, bind_to_session, read_model, with_model_axes, with_model_scanners
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
@@ -27,6 +27,7 @@ from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
+from stitch.session.scanners import join_sessions
 from stitch.system.packages import arrow_alone, stitch_version
 from stitch.system.ply_file import vertex_columns
 from stitch.system.threads import library_threads_off
@@ -120,10 +121,12 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     """
     document, steps = read_documents(folder)
     file, effects = trusted_model(folder, effects_file, trust, document)
-    path = Path(document["session"])
-    if not path.is_dir():
-        raise InputError(f"{folder}/result.json: its session {path} has gone; to fix: restore it or correct the path")
-    session = with_model_axes(load_session(path), file)
+    paths = [Path(path) for path in document.get("sessions", [document["session"]])]
+    gone = next((path for path in paths if not path.is_dir()), None)
+    if gone is not None:
+        raise InputError(f"{folder}/result.json: its session {gone} has gone; to fix: restore it or correct the path")
+    parts = [with_model_axes(load_session(path), file) for path in paths]
+    session = join_sessions(with_model_scanners(parts, file)) if len(parts) > 1 else parts[0]
     with library_threads_off():
         measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
         left_out = results.excluded_views(document)
@@ -151,6 +154,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         left_out=left_out,
         tried={row["effect"]: row["dropped"] for row in _whole_diagnosis(folder).get("tried", ())},
         register_method=results.register_method(document),
+        alone=results.scanners_alone(document),
         **results.RESULT.fields(document, RunData),
     )
 

@@ -32,6 +32,7 @@ from stitch.observations.pose_errors import usual_twist
 from stitch.observations.surfaces.hand_eye_fit import Repeatability, hand_eye_jacobian, repeatability_from
 from stitch.observations.surfaces.matching import Match, match_pairs, sample_points
 from stitch.observations.surfaces.normal_equations import assemble
+from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.screening.hypotheses import problem
 from stitch.screening.problems import SessionProblem
@@ -54,6 +55,8 @@ _LEAST, _SURE, _LEAST_SHARE = 1.5, 5.0, 0.05
 _MARGIN, _REGION, _STRAY = 10.0, 5.0, 0.02
 # Eleven views hardly say how poses scatter: by half of what is usual at the least.
 _LEAST_SCATTER = 0.5
+# Of two scales of scanners, in sigmas of one: four of their difference.
+_SCALES_APART = 4 * np.sqrt(2)
 # Where more of the views stand off, no other says what their surface is.
 _MOST_OFF = 1 / 3
 # Views that are asked: those that stand off, those whose overlaps keep a shape (in sigma of a distance, and in what
@@ -82,9 +85,16 @@ def find_stock(
     for view in _asked(capture, T_mount, unconstrained, scatter, off):
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
-        if stock is not None:
+        if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
             return {view: stock} if len(taken) + 1 <= most else dict.fromkeys(taken)
     return {}
+
+
+def _between_scanners(capture: Capture, view: int) -> float:
+    """Return how far scanners of another scale put a surface off, length_unit: no stock is told from that."""
+    if capture.scanner is None:
+        return 0.0
+    return _SCALES_APART * SCALE_SIGMA * float(np.median(np.linalg.norm(capture.scans[view].points, axis=1)))
 
 
 def stock_problems(session: SessionData, capture: Capture) -> Iterator[SessionProblem]:

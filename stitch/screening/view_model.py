@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import brentq
 
-from stitch.effects.contract import EFFECTS, EVERY_VIEW, missing_need
+from stitch.effects.contract import EFFECTS, EVERY_VIEW, missing_need, of_each_scanner
 from stitch.model.model import Model, term_of
 from stitch.numerics import frames
 from stitch.numerics.distributions import f_limit, f_tail
@@ -363,7 +363,7 @@ class UsualEffects:
         # Steps between two views are tested as blocks of views.
         possible = [
             effect
-            for effect in EFFECTS.values()
+            for effect in of_each_scanner(self.measurement.views, EFFECTS.values())
             if effect.tier == "physical"
             and effect.name not in without
             and all(spec.grid != EVERY_VIEW for spec in effect.specs.values())

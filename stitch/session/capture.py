@@ -21,7 +21,8 @@ from stitch.session.scan import (
     prepare_scan,
     without_stock,
 )
-from stitch.session.session import Cloud, SessionData
+from stitch.session.scanners import scanner_of, scanners_of
+from stitch.session.session import Cloud, Scanner, SessionData
 from stitch.system.threads import parallel
 
 # Where neither a row nor scanner.noise says how well the sensor sees: what a good one does, in metres. The factor
@@ -81,6 +82,7 @@ class Capture:
     T_reference_flange: Array  # (V, 4, 4) carries a twist of the flange into the reference frame
     T_behind_mount: Array | None = None  # (V, 4, 4) what moves the scanner on its mount; None: nothing does
     sightings: Sightings | None = None  # labelled points; scans may be empty then
+    scanner: Indices | None = None  # (V,) of several scanners the one of each view
     # How much more the views scatter than the variance of the surfaces' distances says, for so many of them:
     # what clouds weigh beside labelled points.
     noise_factor: float = 1.0
@@ -107,6 +109,12 @@ class Capture:
     def point_sets(self) -> list[Array]:
         """The same, (N, 3) each, of the views that show any."""
         return [points for points in self.visible_points if len(points)]
+
+    def seen_by(self, scanner: int) -> list[Array]:
+        """Return the points (N, 3) of the views of one of several scanners that show any; of all where there is one."""
+        every = self.visible_points
+        own = self.scanner if self.scanner is not None else np.full(len(every), scanner)
+        return [points for points, k in zip(every, own, strict=True) if k == scanner and len(points)]
 
     @property
     def spacing(self) -> float:
@@ -137,6 +145,7 @@ class Capture:
             T_reference_flange=self.T_reference_flange[keep],
             T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],
             sightings=None if self.sightings is None else self.sightings.without(left_out),
+            scanner=None if self.scanner is None else self.scanner[keep],
         )
 
 
@@ -154,7 +163,13 @@ def prepare_capture(session: SessionData) -> Capture:
             f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
             "surface; to fix: clouds swept over the part, or, of profiles of one sphere, stitch calibrate sphere"
         )
-    return build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session))
+    return of_scanners(session, build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session)))
+
+
+def of_scanners(session: SessionData, capture: Capture) -> Capture:
+    """Return the capture of a joined session with its scanners where they stand to begin with; another as it is."""
+    scanners = scanners_of(session)
+    return replace(capture, T_behind_mount=scanners.behind, scanner=scanners.of_view) if scanners else capture
 
 
 def build_capture(
@@ -173,19 +188,20 @@ def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
     Where room is no matter, all neighbours first: a library finds them without Python, for which the rest waits again
     and again while another thread still loads modules.
     """
-    clouds = [view.cloud for view in session.views if view.cloud is not None]
+    seen = [(scanner_of(session, view), view.cloud) for view in session.views if view.cloud is not None]
+    clouds = [cloud for _, cloud in seen]
     whole = [None if cloud.whole is not None else cloud.points for cloud in clouds]
     around: Iterable[Neighbourhoods | None] = [None] * len(whole)
     if sum(len(points) for points in whole if points is not None) <= _AT_ONCE:
         around = list(parallel(lambda points: None if points is None else find_neighbourhoods(points), whole))
 
-    def prepared(item: tuple[str, Cloud, Neighbourhoods | None]) -> Scan:
-        name, cloud, neighbours = item
+    def prepared(item: tuple[str, tuple[Scanner, Cloud], Neighbourhoods | None]) -> Scan:
+        name, (scanner, cloud), neighbours = item
         if cloud.whole is not None:
             return cloud.whole.scan
-        return prepare_scan(name, cloud.points, eye=session.scanner.eye(cloud.points), around=neighbours)
+        return prepare_scan(name, cloud.points, eye=scanner.eye(cloud.points), around=neighbours)
 
-    return tuple(parallel(prepared, zip(session.names, clouds, around, strict=True), "preparing scans"))
+    return tuple(parallel(prepared, zip(session.names, seen, around, strict=True), "preparing scans"))
 
 
 def sightings_of(session: SessionData) -> Sightings | None:

@@ -19,6 +19,7 @@ from stitch.session.axes import Axes
 from stitch.session.axis_poses import axes_of
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
+from stitch.session.scanners import Scanners, scanners_of
 from stitch.session.session import Mount, SensorKind, SessionData
 from stitch.session.torques import Torques, no_torques, torque_columns, torques_of_views
 
@@ -63,6 +64,17 @@ class Views:
     names: tuple[str, ...] = ()  # of the session's views
     T_mount: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) hand-eye, coarse
     axes: Axes = field(default_factory=Axes)
+    scanners: Scanners = field(default_factory=Scanners)
+    own_first: tuple[dict[str, float], ...] = ()  # the covariates at the first view of each scanner
+
+    @cached_property
+    def by_scanner(self) -> tuple["Views", ...]:
+        """Return all views as the effects of each scanner know them: its hand-eye, standoff and first view."""
+        every = zip(self.scanners.T_first, self.scanners.standoff, self.own_first, strict=True)
+        return tuple(
+            replace(self, T_mount=self.T_mount @ T, standoff=standoff or self.standoff, first=first)
+            for T, standoff, first in every
+        )
 
     @cached_property
     def gravity_at_mount(self) -> Array:
@@ -143,6 +155,7 @@ class Views:
             covariates={name: values[keep] for name, values in self.covariates.items()},
             number=self.number[keep],
             axes=self.axes.only(keep) if self.axes else self.axes,
+            scanners=self.scanners.only(keep),
             gravity=self.gravity if self.gravity.ndim == 1 else self.gravity[keep],
             T_base_flange=self.T_base_flange[keep],
         )
@@ -156,6 +169,7 @@ class Views:
             "temperature": len(self.temperatures) > 0,
             "velocity": self.velocity is not None,
             "axis": bool(self.axes),
+            "scanners": bool(self.scanners),
             "rotary_axis": bool(self.axes.rotary.any()),
             "linear_axis": bool((~self.axes.rotary).any()),
             "time": bool(np.isfinite(self.time).all()) and self.count > 1 and float(np.ptp(self.time)) > 0,
@@ -321,6 +335,7 @@ def views_of(session: SessionData) -> Views:
     """Collect what effects may know; joints count only where the robot's kinematics are known too."""
     views = session.views
     axes = axes_of(session)
+    scanners = scanners_of(session)
     count = len(views)
     has_joints = session.robot is not None and all(view.joints is not None for view in views)
     joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
@@ -357,6 +372,11 @@ def views_of(session: SessionData) -> Views:
         axes=axes,
         eye_to_hand=session.mount == "eye_to_hand",
         names=tuple(session.names),
+        scanners=scanners,
+        own_first=tuple(
+            {name: float(values[of_view][0]) for name, values in covariates.items()}
+            for of_view in scanners.masks(count)
+        ),
     )
 
 

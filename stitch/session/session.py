@@ -106,6 +106,7 @@ class View:
     covariates: dict[str, float]
     sighting: Sighting | None = None  # labelled points or a measured probe
     axis_approach: Array | None = None  # (K,) -1, 0, +1 of the session's axes; their readings are covariates
+    scanner: int = 0  # index of its session among `parts`
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,7 @@ class Scanner:
     optical_axis: Array  # (3,) unit vector in the scanner frame
     kind: SensorKind | None = None  # None: nobody says; whatever a sensor may have can be asked for
     moving: bool = False  # points lie in the scanner's frame at their own time, not at that of the view
+    name: str = ""  # sessions of other scanners have hand-eyes of their own
 
     def eye(self, points: Array) -> Array:
         """Return (3,) from where it looks at points (N, 3), scanner frame: the origin, if not amid what it measures.
@@ -168,6 +170,7 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
     axes: tuple[Axis, ...] = ()  # in the order of the chain
     has_poses: bool = True  # False: axes alone move what is scanned
     usual: dict[str, str] = field(default_factory=dict, compare=False)  # what was only guessed when it was made
+    parts: tuple["SessionData", ...] = ()  # whole sessions of the scanners of which this one was joined
 
     @property
     def reference_frame(self) -> str:
@@ -191,6 +194,11 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
     def names(self) -> list[str]:
         """Of the views, in the session's order."""
         return [view.name for view in self.views]
+
+    @property
+    def states_hand_eye(self) -> bool:
+        """True if session.toml states it, as far as a robot makes it one."""
+        return self.scanner.T_mount is not None and self.has_poses and not self.parts
 
     def without(self, names: Collection[str]) -> "SessionData":
         """Return the session less some views.

@@ -85,6 +85,7 @@ class CaptureEvidence:
     twists: Array  # (V, 6)
     hand_eye_frames: Array  # (V, 4, 4) of the hand-eye
     effect_twists: Array  # (6V, P)
+    common_twists: Array  # (6V, K) by errors of scanners that the answer counts; none of one scanner
 
     @cached_property
     def reduced_poses(self) -> ReducedPoses:
@@ -96,17 +97,24 @@ class CaptureEvidence:
         """(n, P) the effects' columns; None without effects."""
         return self.reduced_poses.reduction @ self.effect_twists if self.effect_twists.shape[1] else None
 
+    @property
+    def common_columns(self) -> Array:
+        """(n, K) visible directions of the same."""
+        return self.reduced_poses.reduction @ self.common_twists
+
     def without(self, views: Indices) -> "CaptureEvidence":
         """Return the same without some views."""
         g = self.gram
         keep = np.asarray(~np.isin(g.pairs, views).any(axis=1))
         number = np.cumsum(~np.isin(np.arange(g.views), views)) - 1
+        rows = (6 * views[:, None] + np.arange(6)).ravel()
         return CaptureEvidence(
             capture=self.capture.without(views),
             gram=replace(g.only(keep), views=g.views - len(views), pairs=number[g.pairs[keep]]),
             twists=np.delete(self.twists, views, 0),
             hand_eye_frames=np.delete(self.hand_eye_frames, views, 0),
-            effect_twists=np.delete(self.effect_twists, (6 * views[:, None] + np.arange(6)).ravel(), axis=0),
+            effect_twists=np.delete(self.effect_twists, rows, axis=0),
+            common_twists=np.delete(self.common_twists, rows, axis=0),
         )
 
     def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
@@ -135,8 +143,11 @@ class RigModel:
         return np.concatenate([np.column_stack([r.hand_eye, r.reduction @ twists]) for r, twists in reduced])
 
     def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> GeneralisedFit:
-        """Return generalised least squares under every session's scatter alone, with a prior (6 + P, 6 + P)."""
-        noise = [pose_covariance(e.reduced_poses, s) for e, s in zip(self.parts, scatter, strict=True)]
+        """Return generalised least squares under every session's scatter, with a prior (6 + P, 6 + P)."""
+        noise = [
+            pose_covariance(e.reduced_poses, s) + e.common_columns @ e.common_columns.T
+            for e, s in zip(self.parts, scatter, strict=True)
+        ]
         return generalised_fit(block_diag(*noise), self.columns, prior)
 
     def mixed(self, errors: PoseErrors) -> MixedModel:
@@ -226,7 +237,11 @@ def fit_hand_eye(
             average the scatter of the flange that views show holds it already.
         solved: what `solve_hand_eye` returns of the same, if it is at hand.
     """
-    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, columns)
+    # One scanner's errors move another's hand-eye, through the surfaces that both see, no more than they have to.
+    apart = any(capture.scanner is not None for capture in captures)
+    errors_of_scanners = list((scanner_errors or {}).values()) if apart else []
+    common = [np.hstack(of_capture) for of_capture in zip(*errors_of_scanners, strict=True)]
+    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, columns, common)
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
     repeating = errors.restricted(errors.causes - {JOINT_SCATTER})
     sources = _variance_sources(solution, repeating, scanner_errors or {})
@@ -264,7 +279,7 @@ def _variance_sources(
     for name, twists in scanner_errors.items():
         columns = rig.reduce(twists)
         repeated = gls.gain @ columns
-        if name == SCANNER_SCALE:
+        if name == SCANNER_SCALE and not rig.parts[0].common_twists.size:
             scatter = np.einsum("c,cij->ij", mean, mixed.components[:, 0])
             repeated = repeated @ _posterior_root(rig, scatter, columns)
         sources[name] = repeated @ repeated.T
@@ -313,13 +328,16 @@ def solve_hand_eye(
     unconstrained: Sequence[UnconstrainedPoses],
     T_mount: Array,
     columns: FittedEffects | None = None,
+    common: Sequence[Array] = (),
 ) -> HandEyeSolution:
-    """Return the answer in which views weigh by the scatter that they show; arguments as of `fit_hand_eye`."""
+    """Return the answer in which views weigh by the scatter that they show, and by errors that they have in `common`,
+    (6V, K) a capture; other arguments as of `fit_hand_eye`."""
+    none = tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained)
     if columns is None:
-        columns = FittedEffects(tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained), np.zeros(0), np.zeros(0))
+        columns = FittedEffects(none, np.zeros(0), np.zeros(0))
     parts = [
-        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), twists)
-        for c, f, twists in zip(captures, unconstrained, columns.twists, strict=True)
+        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), twists, shared)
+        for c, f, twists, shared in zip(captures, unconstrained, columns.twists, common or none, strict=True)
     ]
     rig = RigModel(parts)
     scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns) for e in parts)

@@ -79,18 +79,23 @@ def field_scatter(
     Args:
         share: rms of the errors over the scanner's noise; None takes it from what the overlaps show.
     """
-    sums, noise = sum_smooth_errors(measurement, unconstrained)
-    twists = apparent_twists(sums, unconstrained)
-    if not np.isfinite(noise):
-        return np.zeros_like(twists)
-    if share is not None:
-        return twists * noise * share
-    field, incidence = shared_error_likelihood(sums, twists, unconstrained, noise).map_shares
-    return twists * noise * np.append(np.full(twists.shape[1] - 1, field), incidence)
+    every = []
+    for views in measurement.views.scanners.masks(measurement.views.count):
+        sums, noise = sum_smooth_errors(measurement, unconstrained, views=views)
+        twists = apparent_twists(sums, unconstrained)
+        if not np.isfinite(noise):
+            sizes = np.zeros(twists.shape[1])
+        elif share is not None:
+            sizes = np.full(twists.shape[1], noise * share)
+        else:
+            field, incidence = shared_error_likelihood(sums, twists, unconstrained, noise).map_shares
+            sizes = noise * np.append(np.full(twists.shape[1] - 1, field), incidence)
+        every.append(twists * sizes)
+    return np.hstack(every)
 
 
 def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -> Array:
-    """Return twists (6V, 1) that the views show for one standard deviation of the scanner's scale; none of a tracker.
+    """Return twists (6V, K) that the views show for one standard deviation of each scanner's scale; none of a tracker.
 
     Scans that are all too large by the same share still fit each other, each moved along the way from the part to its
     scanner: so no overlap shows the scale, but the ways of the arm do. An arm whose lengths are all too short looks so.
@@ -98,7 +103,9 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
     if not measurement.has_optics:
         return np.zeros((6 * len(unconstrained.poses), 1))
     away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
-    return SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1)
+    scanners = measurement.views.scanners.masks(len(away))
+    own = [np.hstack([np.zeros_like(away), away * views[:, None]]).ravel() for views in scanners]
+    return SCALE_SIGMA * np.column_stack(own)
 
 
 def sum_smooth_errors(
@@ -106,6 +113,7 @@ def sum_smooth_errors(
     unconstrained: UnconstrainedPoses,
     point_effects: PointSlopes | None = None,
     per_view: bool = False,
+    views: Mask | None = None,
 ) -> tuple[PointGram, float]:
     """Return sums of smooth errors of unit size, then of what is beside them, and the noise; NaN without scans.
 
@@ -114,11 +122,14 @@ def sum_smooth_errors(
     Args:
         per_view: those of COARSE for either view of a pair its own; and after the one over incidence what all views may
             have in common besides.
+        views: (V,) bool, those of one scanner, which alone has the errors; None: all.
     """
     capture = measurement.capture
-    half = half_field(measurement)
+    own = np.ones(len(unconstrained.poses), bool) if views is None else views
+    half = half_field(measurement, own)
     further = point_effects or PointSlopes(measurement, ())
-    standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in capture.scans])))
+    scans = [scan for scan, has_them in zip(capture.scans, own, strict=True) if has_them]
+    standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in scans])))
 
     def corrections(away: Array, cosine: Array) -> Array:
         corrected = smooth_corrections(away, cosine, half)
@@ -127,6 +138,7 @@ def sum_smooth_errors(
     def of_points(v: int, index: Indices) -> Array:
         scan = capture.scans[v]
         smooth = corrections(scan.points.take(index, axis=0) - scan.eye, measurement.scan_views[v].cosine[index])
+        smooth = smooth if own[v] else np.zeros_like(smooth)
         return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
 
     def of_targets() -> Array:
@@ -135,16 +147,18 @@ def sum_smooth_errors(
         # An empty slot has no ray; nobody knows at what slant a target was seen.
         flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
         moved = corrections(flat, np.ones(len(flat))).reshape(-1, *points.shape)
-        smooth = np.where(seen[..., None], moved, 0.0)
+        smooth = np.where((seen & own[:, None])[..., None], moved, 0.0)
         return np.concatenate([smooth, further.at_targets(unconstrained.poses)])
 
     sums = stream_point_sums(unconstrained, capture.noise_factor, of_points, of_targets, COARSE if per_view else 0)
-    return sums, float(np.nanmedian([scan.noise for scan in capture.scans]))
+    return sums, float(np.nanmedian([scan.noise for scan in scans]))
 
 
-def half_field(measurement: Measurement) -> Array:
-    """Return (2,): |x/z| and |y/z| in the scanner's frame up to which it sees, but for the corners."""
-    away = np.concatenate([scan.points - scan.eye for scan in measurement.capture.scans])
+def half_field(measurement: Measurement, views: Mask | None = None) -> Array:
+    """Return (2,): |x/z| and |y/z| in the scanner's frame up to which it sees in some views, but for the corners."""
+    scans = measurement.capture.scans
+    of_views = scans if views is None else [scan for scan, counts in zip(scans, views, strict=True) if counts]
+    away = np.concatenate([scan.points - scan.eye for scan in of_views])
     slopes = np.abs(away[:, :2] / away[:, 2:])
     return np.maximum(np.quantile(slopes, _FIELD_QUANTILE, axis=0), 1e-6)
 

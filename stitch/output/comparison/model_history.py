@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.effects.contract import EFFECTS, parameters_in
+from stitch.effects.contract import EFFECTS, find_effect, parameters_in
 from stitch.model.forward import corrected_capture, true_geometry
 from stitch.model.model import Model, Term
 from stitch.numerics import frames
@@ -112,15 +112,16 @@ def models_of(run: RunData) -> list[tuple[str, Model]]:
 
 
 def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
-    if any(name not in EFFECTS or name not in step.values for name in step.effects):
+    if any(name.partition("@")[0] not in EFFECTS or name not in step.values for name in step.effects):
         return None
     terms = []
     # Where axes stand is in every model.
     placed = [name for name in step.values if name in EFFECTS and EFFECTS[name].tier == "geometry"]
     for name in (*placed, *step.effects):
-        parameters = parameters_in(measurement, EFFECTS[name])
+        effect = find_effect(name)
+        parameters = parameters_in(measurement, effect)
         values = [step.values[name].get(p.name, 0.0) for p in parameters]
-        terms.append(Term(EFFECTS[name], parameters).at(np.array(values)))
+        terms.append(Term(effect, parameters).at(np.array(values)))
     return Model(step.T_mount, tuple(terms))
 
 

@@ -236,6 +236,8 @@ def session_hash(session: SessionData) -> str:
 
     A dash where the session does not lie on disk any more.
     """
+    if session.parts:
+        return "+".join(map(session_hash, session.parts))
     try:
         files = measured_files(session.path)
     except (OSError, ValueError, csv.Error):

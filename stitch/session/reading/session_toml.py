@@ -35,7 +35,7 @@ from stitch.session.session import Scanner, SensorKind, StatedRepeatability
 SESSION_FORMAT = "stitch-session/1"
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part", "axis"},
-    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving", "name"},
     "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
@@ -131,7 +131,10 @@ def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
     moving = table.get("moving", False)
     if not isinstance(moving, bool):
         raise InputError(f"{file}: scanner.moving is {shortened(moving)}; use true or false")
-    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind), moving)
+    name = optional_text(file, table, "scanner", "name") or ""
+    if name and not _AXIS_NAME.fullmatch(name):
+        raise InputError(f'{file}: scanner.name is {shortened(name)}; to fix: letters and digits, as name = "left"')
+    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind), moving, name)
 
 
 def _read_pose(file: Path, value: Any) -> Array:

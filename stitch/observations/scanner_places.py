@@ -1,0 +1,125 @@
+"""Where each of several scanners in one cell stands under their common model, beside what its own views alone say."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stitch.effects.axis_effects import SCANNER_PLACEMENT
+from stitch.model.model import COVERAGE_FACTOR, Model, displacement
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import length_text
+from stitch.observations.observability import seen_part, unknown_numbers, unobservable
+from stitch.session.measurement import Measurement
+from stitch.system.values import Value
+
+# Alone and together share a scanner's own views: what they differ by is less than the U of alone says. Beyond this
+# multiple of it the scanners contradict each other (custom).
+_CONTRADICTS = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class ScannerAlone(Value):
+    """The hand-eye of one scanner from its own views alone.
+
+    Example:
+        >>> run.alone
+        ()
+    """
+
+    scanner: str
+    hand_eye: Array  # (4, 4) T_mount_scanner
+    covariance: Array  # (6, 6) of T·exp(ξ)
+
+
+@dataclass(frozen=True, eq=False)
+class ScannerPlace(Value):
+    """One scanner where a model of several puts it; lengths in length_unit, angles in rad.
+
+    Example:
+        >>> [scanner.name for scanner in run.scanners]
+        []
+    """
+
+    name: str
+    T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
+    covariance: Array  # (6, 6) of T·exp(ξ), rotation first
+    U: float  # at what it saw
+    alone: ScannerAlone | None = None
+    U_alone: float = float("nan")
+    apart: float = float("nan")  # what its own views alone would move what it saw by
+    unobservable: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = field(default=())
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether its own views put it elsewhere than the others do, beyond what their U allows."""
+        return self.apart > _CONTRADICTS * self.U_alone
+
+
+def scanner_places(
+    measurement: Measurement, model: Model, alone: tuple[ScannerAlone, ...] = ()
+) -> tuple[ScannerPlace, ...]:
+    """Return where several scanners stand; none of one.
+
+    Args:
+        alone: of each scanner, or none.
+    """
+    scanners = measurement.views.scanners
+    capture = measurement.capture
+    term = next((term for term in model.terms if term.name == SCANNER_PLACEMENT), None)
+    if not scanners or term is None:
+        return ()
+    known = model.effects_covariance
+    rows = [f"{term.name}.{p.name}" for p in term.parameters]
+    K = len(scanners.names) - 1
+    # Parameters stand rotations of all first, then their shifts; here scanner by scanner.
+    order = np.arange(6 * K).reshape(2, K, 3).transpose(1, 0, 2).reshape(K, 6)
+    moved = np.vstack([np.zeros(6), term.values[order]])
+    known_by_name = {name: i for i, name in enumerate(known.names)}
+    by_own_views = {own.scanner: own for own in alone}
+    places = []
+    for k, name in enumerate(scanners.names):
+        T_first = scanners.T_first[k] @ frames.exp(moved[k])
+        T_mount = model.T_mount @ T_first
+        J = np.hstack([frames.adjoint(frames.inverse(T_first)), np.eye(6)])
+        joint = np.zeros((12, 12))
+        joint[:6, :6] = model.covariance
+        at = [] if k == 0 else [known_by_name.get(rows[i], -1) for i in order[k - 1]]
+        for a, i in ((a, i) for a, i in enumerate(at) if i >= 0):
+            joint[:6, 6 + a] = joint[6 + a, :6] = known.with_hand_eye[:, 6 + i] if known.with_hand_eye.size else 0.0
+            joint[6 + a, 6:] = [known.matrix[i, j] if j >= 0 else 0.0 for j in at]
+        covariance = J @ joint @ J.T
+        middle = seen_part([capture], k)[0]
+        own = by_own_views.get(name)
+        off = np.zeros(3) if own is None else frames.transform(own.hand_eye, middle) - frames.transform(T_mount, middle)
+        places.append(
+            ScannerPlace(
+                name,
+                T_mount,
+                covariance,
+                displacement(covariance, middle),
+                own,
+                float("nan") if own is None else displacement(own.covariance, middle),
+                float("nan") if own is None else float(np.linalg.norm(off)),
+                unobservable([capture], model.T_mount, measurement.robot, scanner=k),
+                unknown_numbers([capture], model.T_mount, k),
+            )
+        )
+    return tuple(places)
+
+
+def contradictions(places: tuple[ScannerPlace, ...], length_unit: str) -> tuple[str, ...]:
+    """Return a doubt of each scanner whose own views put it elsewhere than all together do."""
+    return tuple(
+        f"scanner {p.name} contradicts the others: its own views put it {length_text(p.apart, length_unit)} away where "
+        f"U (k = {COVERAGE_FACTOR:g}) is {length_text(p.U_alone, length_unit, 2)}; to fix: check that part, arm and "
+        "clock of the sessions are the same; `stitch diagnose` asks what a scanner does wrong"
+        for p in places
+        if p.contradicts
+    )

@@ -1,0 +1,112 @@
+"""Sessions of several scanners in one cell as one session: every view knows whose it is.
+
+One arm, its axes and one part are common; each scanner has a hand-eye of its own. That of the first is the model's.
+Another stands a rigid motion right of it, `T_first`, in its own views; where it truly stands is fitted from there.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.session.session import Scanner, SessionData, View
+
+
+@dataclass(frozen=True)
+class Scanners:
+    """The K scanners of V views; false for a session of one."""
+
+    names: tuple[str, ...] = ()
+    of_view: Indices = field(default_factory=lambda: np.zeros(0, np.int64))  # (V,)
+    T_first: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (K, 4, 4) T_scanner1_scanner, to begin with
+    standoff: tuple[float | None, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.names)
+
+    @property
+    def behind(self) -> Array | None:
+        """(V, 4, 4) what stands right of the first scanner's hand-eye; None for one scanner."""
+        return self.T_first[self.of_view] if self else None
+
+    def only(self, keep: Sequence[int]) -> "Scanners":
+        """Return the scanners of some of the views."""
+        return replace(self, of_view=self.of_view[list(keep)]) if self else self
+
+    def masks(self, count: int) -> list[Mask]:
+        """Return (V,) bool, the views of each scanner; one scanner has all `count`."""
+        return [self.of_view == k for k in range(len(self.names))] if self else [np.ones(count, bool)]
+
+
+def scanners_of(session: SessionData) -> Scanners:
+    """Return the scanners of a joined session; none for another."""
+    if not session.parts:
+        return Scanners()
+    mounts = [part.scanner.T_mount for part in session.parts]
+    known = [np.eye(4) if T is None else T for T in mounts]
+    return Scanners(
+        tuple(part.scanner.name for part in session.parts),
+        np.array([view.scanner for view in session.views], np.int64),
+        np.array([frames.inverse(known[0]) @ T for T in known]),
+        tuple(part.scanner.standoff for part in session.parts),
+    )
+
+
+def scanner_of(session: SessionData, view: View) -> Scanner:
+    """Return the scanner of a view."""
+    return session.parts[view.scanner].scanner if session.parts else session.scanner
+
+
+def have_own_hand_eyes(sessions: Sequence[SessionData]) -> bool:
+    """Return whether sessions are those of several scanners in one cell, which are stitched as one.
+
+    Raises:
+        InputError: a scanner without a name beside others, or two sessions of one scanner beside another's.
+    """
+    names = [session.scanner.name for session in sessions]
+    if len(set(names)) < 2 or not all(session.has_clouds for session in sessions):
+        return False
+    odd = next((s for s in sessions if not s.scanner.name or names.count(s.scanner.name) > 1), None)
+    if odd is not None:
+        raise InputError(
+            f"{odd.path}: scanner.name is {odd.scanner.name!r} beside {', '.join(map(repr, names))}; to fix: name "
+            "every scanner, and give one session a scanner"
+        )
+    return True
+
+
+def join_sessions(sessions: Sequence[SessionData]) -> SessionData:
+    """Return the session of all views, each named VIEW@SCANNER: in the order of time where all state it.
+
+    Where the scanners stand to begin with is each session's `scanner.T_mount`.
+    """
+    first = sessions[0]
+    views = [
+        replace(view, name=f"{view.name}@{session.scanner.name}", scanner=k)
+        for k, session in enumerate(sessions)
+        for view in session.views
+    ]
+    times = [view.time_s for view in views if view.time_s is not None]
+    if len(times) == len(views):
+        views = [views[i] for i in np.argsort(times, kind="stable")]
+    noise = {session.scanner.noise for session in sessions}
+    kinds = {session.scanner.kind for session in sessions}
+    scanner = replace(
+        first.scanner,
+        name="",
+        noise=noise.pop() if len(noise) == 1 else None,
+        kind=kinds.pop() if len(kinds) == 1 else None,
+        standoff=None,
+    )
+    return replace(
+        first,
+        name="+".join(session.name for session in sessions),
+        scanner=scanner,
+        views=tuple(views),
+        warnings=tuple(warning for session in sessions for warning in session.warnings),
+        parts=tuple(sessions),
+        usual=dict(guess for session in sessions for guess in session.usual.items()),
+    )
