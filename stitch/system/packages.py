@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from threading import get_ident
 from typing import Any
 
 from stitch.errors import InputError
@@ -72,12 +73,14 @@ def stitch_version() -> str:
 @cache
 def arrow_alone() -> Any:
     """Return pyarrow, which at its first list loads pandas where that is installed, a third of a second, to know one of
-    its columns by sight: here no such column comes, and pyarrow asks once."""
+    its columns by sight: here no such column comes, and pyarrow asks once. Other threads find pandas meanwhile."""
     import pyarrow
+
+    asking = get_ident()
 
     class NoPandas:
         def find_spec(self, name: str, *_: object) -> None:
-            if name == "pandas":
+            if name == "pandas" and get_ident() == asking:
                 raise ModuleNotFoundError(name=name)
 
     finder: Any = NoPandas()

@@ -196,3 +196,23 @@ def test_what_is_left_out_is_a_package_that_is_known():
         raise ModuleNotFoundError("no", name="rerun")
     with pytest.raises(ModuleNotFoundError), unless_missing():
         raise ModuleNotFoundError("no", name="stitch.nothing")
+
+
+def test_other_threads_find_pandas_while_arrow_is_asked_for_none():
+    pytest.importorskip("pandas")
+    program = (
+        "import importlib.util, sys, threading, pyarrow\n"
+        "from stitch.system.packages import arrow_alone\n"
+        "found, array = [], pyarrow.array\n"
+        "def ask(values):\n"
+        "    find = lambda: found.append(importlib.util.find_spec('pandas') is not None)\n"
+        "    thread = threading.Thread(target=find)\n"
+        "    thread.start()\n"
+        "    thread.join()\n"
+        "    return array(values)\n"
+        "pyarrow.array = ask\n"
+        "arrow_alone()\n"
+        "print(found, 'pandas' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["[True]", "False"]

@@ -141,7 +141,7 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     quantities, values, nominal, slopes = number_table(wanted.features, fits)
     responses = stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
     variances, vectors = np.linalg.eigh(responses.noise)
-    rows = [(s.name, responses.loadings(s), s.degrees) for s in places.sources]
+    rows = [(s.name, responses.loadings(s), s.degrees) for s in _not_stated(places, wanted)]
     rows.append((OWN_NOISE, vectors * np.sqrt(np.maximum(variances, 0.0)), np.inf))
     rows += [(c.source, _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
     covariance = np.sum([loadings @ loadings.T for _, loadings, _ in rows], axis=0)
@@ -173,6 +173,12 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
             )
         )
     return MeasuredFeatures(tuple(numbers), covariance[np.ix_(kept, kept)], tuple(fits), length_unit)
+
+
+def _not_stated(places: PlaceErrors, wanted: FeatureList) -> list[ErrorSource]:
+    """Return the sources that count: what is stated under the name of one takes the place of what is usual."""
+    stated = {contribution.source for contribution in wanted.contributions}
+    return [source for source in places.sources if source.name not in stated]
 
 
 def measured_rows(quantities: Sequence[tuple[Feature, str]]) -> list[int]:
@@ -303,7 +309,7 @@ def monte_carlo(
     rng = np.random.default_rng(seed)
     thin = [fit.thinned(_TRIAL_POINTS) for fit in fits]
     linear = evaluate(places, wanted, thin)
-    modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in places.sources]
+    modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in _not_stated(places, wanted)]
     by_feature = {fit.feature.name: (fit.feature, _refits(places, fit, modes, trials, rng)) for fit in thin}
     quantities, values, _, _ = number_table(wanted.features, thin)
     columns = list[Array]()

@@ -45,6 +45,8 @@ WANDERING = "robot: wandering in time"
 STOP = "robot: shared by the scans of a stop"
 OVERLAPS = "noise of the overlaps"
 SCANNER = "scanner: smooth errors"
+# On a ball this is a shell of one thickness, and a way of each view along its ray: no overlap shows it.
+INCIDENCE = "scanner: error over incidence"
 SCAN = "scanner: smooth errors new in each scan"
 OTHER_RUN = "model of another run"
 OTHER_ARM = "arm of another run"
@@ -52,6 +54,7 @@ UNSEEN = "hand-eye: not shown by the motions"
 # What a session does not show of itself.
 NOT_INCLUDED = (
     "scale of the scanner, where range_scale is not in the model: an artefact of known length shows it",
+    "an error over incidence that is larger than usual: a ball of known diameter shows it",
     "temperature of the part, against 20 °C and over the session",
     "clamping of the part, and how it bends",
     "effects that the model lacks (stitch diagnose)",
@@ -173,69 +176,69 @@ def _follow_overlaps(run: RunData, capture: Capture, solution: HandEyeSolution, 
 
 def _sources(run: RunData, chain: ErrorChain) -> tuple[tuple[ErrorSource, ...], ScanErrors | None]:
     """Return all sources, and the smooth errors that are new in each scan."""
-    twists, shapes, degrees, errors = _smooth_errors(run, chain)
+    twists, shared, errors = _smooth_errors(run, chain)
     of_scans = list[Array]()
     if errors is not None:
         views = range(len(run.poses))
         of_scans = [scan_error_twists(run.measurement, chain.unconstrained, errors, v) for v in views]
-    smooth = twists @ shapes
-    sources = [
-        _source(chain, (SCANNER, chain.of_overlaps(smooth), degrees), shapes),
-        *(_source(chain, modes, shapes) for modes in _pose_modes(run, chain, np.hstack([smooth, *of_scans]))),
-        *(_source(chain, modes, shapes) for modes in _model_modes(run, chain)),
-    ]
+    kinds = len(twists.T)
+    sources = [_source(chain, (name, chain.of_overlaps(twists @ f), nu), kinds, f) for name, f, nu in shared]
+    smooth = np.hstack([*(twists @ shapes for _, shapes, _ in shared), *of_scans])
+    sources += [_source(chain, modes, kinds) for modes in _pose_modes(run, chain, smooth)]
+    sources += [_source(chain, modes, kinds) for modes in _model_modes(run, chain)]
     for v, moved in enumerate(of_scans):
         assert errors is not None
         # Each scan is a row of its own, and one size is known for all.
         modes = (SCAN, chain.of_overlaps(moved), errors.degrees / len(of_scans))
-        sources.append(replace(_source(chain, modes, shapes), scan=v))
+        sources.append(replace(_source(chain, modes, kinds), scan=v))
     return tuple(sources), errors
 
 
-def _source(chain: ErrorChain, modes: _Modes, shapes: Array) -> ErrorSource:
-    """Return a source by its modes; of the scanner's own, the first, they are shapes (K, K) of its smooth errors."""
+def _source(chain: ErrorChain, modes: _Modes, kinds: int, shapes: Array | None = None) -> ErrorSource:
+    """Return a source by its modes; those of the scanner's own are shapes (kinds, m) of its smooth errors."""
     name, (views, x), degrees = modes
     parameters = np.zeros((len(chain.fitted), x.shape[1]))
     parameters[chain.fitted] = x[6:]
-    field = shapes if name == SCANNER and x.shape[1] == shapes.shape[1] else np.zeros((len(shapes), x.shape[1]))
+    field = np.zeros((kinds, x.shape[1])) if shapes is None else shapes
     return ErrorSource(name, views, parameters[chain.of_points], field, degrees)
 
 
-def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, Array, float, ScanErrors | None]:
-    """Return twists (6V, K) that the overlaps show for unit smooth errors which all views share, these errors (K, K) as
-    K independent ones of unit variance, degrees of freedom, and those that are new in each scan.
+def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, list[tuple[str, Array, float]], ScanErrors | None]:
+    """Return twists (6V, K) that the overlaps show for unit smooth errors which all views share, by source what they
+    are (K, m) as m independent ones of unit variance with degrees of freedom, and those that are new in each scan.
 
     The overlaps show a part of the errors themselves: what counts is their second moment given that, f̂f̂ᵀ + C, since no
-    point is corrected by it. A size whose logarithm is known to s has ½/s² degrees of freedom (JCGM 100, G.4.2).
+    point is corrected by it. A size whose logarithm is known to s has e^(2s²) times the square of its likeliest value
+    as its mean square, and ½/s² degrees of freedom (JCGM 100, G.4.2).
     """
     sums, noise = sum_smooth_errors(run.measurement, chain.unconstrained)
     twists = apparent_twists(sums, chain.unconstrained)
+    units = np.split(np.eye(twists.shape[1]), [-1], axis=1)
     if not np.isfinite(noise):
-        return twists, np.zeros((twists.shape[1], twists.shape[1])), _MANY, None
+        return twists, [(SCANNER, 0 * units[0], _MANY)], None
     likelihood = shared_error_likelihood(sums, twists, chain.unconstrained, noise)
-    shares = likelihood.map_shares
-    causes = range(len(shares))
-    estimates = [noise * shares[cause] * likelihood.estimate(cause, shares) for cause in causes]
-    moments = [
-        np.outer(f, f) + (noise * shares[cause]) ** 2 * likelihood.posterior_covariance(cause, shares)
-        for cause, f in enumerate(estimates)
-    ]
-    degrees = float((0.5 / likelihood.share_spread(shares) ** 2).min())
+    spread = likelihood.share_spread(likelihood.map_shares)
+    shares = likelihood.map_shares * np.exp(spread**2)
+    estimates = []
+    shared = []
+    for cause, name in enumerate((SCANNER, INCIDENCE)):
+        size = noise * shares[cause]
+        estimates.append(size * likelihood.estimate(cause, shares))
+        moment = np.outer(estimates[-1], estimates[-1]) + size**2 * likelihood.posterior_covariance(cause, shares)
+        shared.append((name, units[cause] @ np.linalg.cholesky(moment), float(0.5 / spread[cause] ** 2)))
     half = half_field(run.measurement)
-    errors = fit_scan_errors(run.measurement, chain.unconstrained, noise, np.concatenate(estimates), half)
-    return twists, np.linalg.cholesky(block_diag(*moments)), degrees, errors
+    return twists, shared, fit_scan_errors(run.measurement, chain.unconstrained, noise, np.concatenate(estimates), half)
 
 
 def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
-    """Errors of the poses and the noise of the overlaps, as large as the views show them.
-
-    What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
-    """
+    """Errors of the poses and the noise of the overlaps, as large as the views show them beside smooth errors (6V, K)
+    of the scanner, which are sources of their own."""
     rig = chain.solution.rig
     g = chain.unconstrained.overlaps.gram
     errors = prior_pose_errors([run.measurement], run.model, [g.centre])
     errors = errors.restricted(errors.causes - {JOINT_SCATTER})
-    mixed = rig.mixed(errors)
+    reduced_smooth = rig.reduce([smooth])
+    mixed = replace(rig.mixed(errors), fixed=(reduced_smooth @ reduced_smooth.T)[None])
     sizes = fit_variances(mixed, both_starts=True)
     sigma = np.sqrt(mean_variances(mixed, sizes))
     known = 2 / np.clip(np.diag(satterthwaite(mixed, sizes).spread), 2 / _MANY, 2.0)
@@ -245,11 +248,7 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
         yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k])
     visible = g.visible
     noise = sigma[NOISE] * visible.scale[:, None] * visible.vectors * np.sqrt(g.variance / visible.values)
-    reduced_smooth = rig.reduce([smooth])
-    beside = replace(mixed, fixed=(reduced_smooth @ reduced_smooth.T)[None])
-    left = mean_variances(beside, fit_variances(beside, both_starts=True))[NOISE] / sigma[NOISE] ** 2
-    for name, share in ((OVERLAPS, min(left, 1.0)), (SCANNER, 1.0 - min(left, 1.0))):
-        yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE])
+    yield OVERLAPS, chain.of_overlaps(noise), float(known[NOISE])
     names = dict.fromkeys(DRIFT_MEMORY, WANDERING) | dict.fromkeys(STOP_COMPONENTS, STOP)
     for k, (name, component) in enumerate(zip(errors.names, errors.components, strict=True), NOISE + 1):
         yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k])

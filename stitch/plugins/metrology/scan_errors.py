@@ -32,10 +32,8 @@ from stitch.session.measurement import Measurement
 _LENGTHS = (0.12, 0.2, 0.33, 0.55)
 # Sizes s that are tried, in the scanner's noise, and noise of a pair, in its robust sigma.
 _SIZES, _NOISES = np.geomspace(0.02, 10.0, 32), np.geomspace(0.2, 1.6, 24)
-# Distances of a pair that are compared, the fewest that tell anything, and pairs of a session.
-_MOST_SAMPLES, _FEWEST, _MOST_PAIRS = 200, 40, 24
-# A point's place times this, less whole numbers, is as good as drawn.
-_SHUFFLE = 1e3 * (np.sqrt(5) - 1)
+# Means of neighbours that are compared in a pair, the fewest distances that tell anything, and pairs of a session.
+_MOST_SAMPLES, _FEWEST, _MOST_PAIRS = 256, 40, 24
 # Places along one side of the field where errors are free, up to beyond its corners.
 _NODES = np.linspace(-1.3, 1.3, 41)
 # Of the errors' variance this share counts in modes; the others carry the rest. So many modes of all views at most.
@@ -157,23 +155,25 @@ def _pair_samples(
 ) -> list[tuple[Array, Array, list[tuple[Array, Array]]]]:
     """Per pair: distances (N,), rows (N, 6) of a motion, and of either view rays (N, 3) and cosines (N,).
 
-    Which pairs and distances stand for all goes by names and points, not by the order of the views.
+    Each is the mean of neighbours in the field, so that all distances of a pair count; times the root of their share.
+    Which pairs stand for all goes by their scans, not by the order of the views.
     """
     overlaps = unconstrained.overlaps
     g = overlaps.gram
     scans = measurement.capture.scans
-    enough = [m for m in overlaps.matches if len(m.residual) >= _FEWEST]
-    enough.sort(key=lambda m: sorted([scans[m.v].name, scans[m.w].name]))
+    # A scan is told by its points alone.
+    mark = [float(scan.points.sum()) for scan in scans]
+    enough = [m if mark[m.v] < mark[m.w] else m.swapped() for m in overlaps.matches if len(m.residual) >= _FEWEST]
+    enough.sort(key=lambda m: (mark[m.v], mark[m.w]))
     chosen = [enough[k] for k in np.unique(np.linspace(0, len(enough) - 1, _MOST_PAIRS).astype(int))] if enough else []
     samples = []
     for match in chosen:
         sound = np.flatnonzero(np.abs(match.residual) < RMS_GATE * g.scale)
         if len(sound) < _FEWEST:
             continue
-        drawn = scans[match.v].points[match.index_v[sound]].sum(axis=1)
-        drawn += scans[match.w].points[match.index_w[sound]].sum(axis=1)
-        keep = sound[np.argsort(drawn / g.scale * _SHUFFLE % 1.0)[:_MOST_SAMPLES]]
-        m = Match(match.v, match.w, *(column[keep] for column in match.columns))
+        m = Match(match.v, match.w, *(column[sound] for column in match.columns))
+        cell = _field_cells(scans[m.v].points[m.index_v] - scans[m.v].eye, m.index_w)
+        count = np.bincount(cell)
         distances = np.array(m.residual)
         sides = []
         for view, index, sign in ((m.v, m.index_v, 1.0), (m.w, m.index_w, -1.0)):
@@ -183,9 +183,39 @@ def _pair_samples(
             pose = unconstrained.poses[view]
             undone = np.tensordot(shared, smooth_corrections(away, cosine, half), axes=1)
             distances -= sign * np.einsum("ni,ni->n", undone, frames.rotate(frames.inverse(pose), m.normal))
-            sides.append((away, _cosines(away, m.normal, pose)))
-        samples.append((distances, frames.plane_rows(m.middle - g.centre, m.normal), sides))
+            sides.append((_means(away, cell), _means(_cosines(away, m.normal, pose), cell)))
+        share = np.sqrt(count / count.mean())
+        rows = _means(frames.plane_rows(m.middle - g.centre, m.normal), cell)
+        samples.append((share * _means(distances, cell), share[:, None] * rows, [(a, share * c) for a, c in sides]))
     return samples
+
+
+def _field_cells(away: Array, partner: Indices) -> Indices:
+    """(N,) cells, at most so many, in which rays (N, 3) lie close together: halved along the longer side, in turn.
+
+    Args:
+        partner: (N,) that tells apart what lies at one place, whatever its order.
+    """
+    places = away[:, :2] / away[:, 2:]
+    cells = [np.arange(len(places))]
+    while 2 * len(cells) <= min(_MOST_SAMPLES, len(places)):
+        halves = []
+        for members in cells:
+            side = int(np.ptp(places[members], axis=0).argmax())
+            order = np.lexsort((partner[members], places[members, 1 - side], places[members, side]))
+            halves += np.array_split(members[order], 2)
+        cells = halves
+    cell = np.empty(len(places), np.int64)
+    for number, members in enumerate(cells):
+        cell[members] = number
+    return cell
+
+
+def _means(values: Array, cell: Indices) -> Array:
+    """Return the means (n, ...) of values (N, ...) in each cell."""
+    sums = np.zeros((int(cell.max()) + 1, *values.shape[1:]))
+    np.add.at(sums, cell, values)
+    return np.asarray((sums.T / np.bincount(cell)).T)
 
 
 def _cosines(away: Array, normal: Array, pose: Array) -> Array:

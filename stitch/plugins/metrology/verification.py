@@ -40,6 +40,7 @@ _ANSWERS_TO = {
     error_sources.WANDERING: ARM,
     error_sources.STOP: ARM,
     error_sources.SCANNER: SCANNER,
+    error_sources.INCIDENCE: SCANNER,
     error_sources.SCAN: SCANNER,
 }
 # By kind of feature the name of the error of its first number.

@@ -46,4 +46,4 @@ def test_the_order_of_the_views_changes_nothing(monkeypatch):
     # Half of the pairs, so that it counts which they are.
     monkeypatch.setattr("stitch.plugins.metrology.scan_errors._MOST_PAIRS", 5)
     sizes = [place_errors(run(replace(session, views=tuple(order)))).scan_errors.size for order in (views, views[::-1])]
-    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-6)

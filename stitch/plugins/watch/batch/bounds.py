@@ -5,6 +5,7 @@ A worker's thread cannot be interrupted, and one session that takes all memory t
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import time
@@ -15,7 +16,8 @@ from stitch.errors import NoResultError
 from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, failed_row, run_session
 
 _PROGRAM = "from stitch.plugins.watch.batch.bounds import main; main()"
-_NO_MEMORY = ("MemoryError", "cannot allocate", "not enough memory")
+# What Python, the allocators of C and C++, and OpenBLAS say where memory ends.
+_NO_MEMORY = ("memoryerror", "cannot allocate", "not enough memory", "bad_alloc", "memory allocation")
 
 
 def run_bounded(job: BatchJob) -> SessionRow:
@@ -34,16 +36,17 @@ def run_bounded(job: BatchJob) -> SessionRow:
     except subprocess.TimeoutExpired:
         late = NoResultError(f"took more than {job.seconds:g} s; to fix: give it longer, or thin its scans")
         return failed_row(str(job.session), job.name, late)
-    if ended.returncode == 0:
-        row: SessionRow = pickle.loads(ended.stdout)
-        if row.error is None or not row.error.startswith(_NO_MEMORY):
-            return row
-    elif job.memory == 0:
-        words = ended.stderr.decode("utf-8", "replace").split()[-20:]
-        died = NoResultError(f"its process died with {ended.returncode}: {' '.join(words)}")
-        return failed_row(str(job.session), job.name, died)
-    full = NoResultError(f"needs more than {job.memory / 1e9:g} GB; to fix: give it more, or thin its scans")
-    return failed_row(str(job.session), job.name, full)
+    row: SessionRow | None = pickle.loads(ended.stdout) if ended.returncode == 0 else None
+    said = ended.stderr.decode("utf-8", "replace") if row is None else row.error or ""
+    bad_input = row is not None and row.bad_input
+    if job.memory and not bad_input and any(words in said.lower() for words in _NO_MEMORY):
+        full = NoResultError(f"needs more than {job.memory / 1e9:g} GB; to fix: give it more, or thin its scans")
+        return failed_row(str(job.session), job.name, full)
+    if row is not None:
+        return row
+    end = f"code {ended.returncode}" if ended.returncode > 0 else signal.strsignal(-ended.returncode)
+    last = " ".join(said.split()[-20:]) or "it said nothing"
+    return failed_row(str(job.session), job.name, NoResultError(f"its process ended with {end}: {last}"))
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.output.run_folder import write_with_page
-from stitch.plugins.watch.batch import cluster, run_batch
+from stitch.plugins.watch.batch import bounds, cluster, run_batch
 from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
 from stitch.plugins.watch.verb import batch as stitch_batch
 from viz.batch_page import write_page
@@ -277,6 +277,21 @@ def test_a_session_beyond_its_seconds_or_memory_is_ended_and_the_others_run(sess
     capsys.readouterr()
     batch(*sessions, "--json")
     assert json.loads(capsys.readouterr().out)["skipped"] == 2
+
+
+@pytest.mark.parametrize(
+    ("ends", "said"),
+    [
+        ("os.kill(os.getpid(), 11)", "its process ended with Segmentation fault: it said nothing"),
+        ("print('no key', file=sys.stderr); os._exit(3)", "its process ended with code 3: no key"),
+        ("os.write(2, b'std::bad_alloc'); os.abort()", "needs more than 4 GB; to fix: give it more"),
+        ("raise MemoryError", "needs more than 4 GB; to fix: give it more"),
+    ],
+)
+def test_a_process_that_dies_within_a_limit_of_memory_is_said_to_lack_it_only_where_it_says_so(ends, said, monkeypatch):
+    monkeypatch.setattr(bounds, "_PROGRAM", f"import os, sys; {ends}")
+    row = bounds.run_bounded(run_batch.BatchJob(Path("s"), Path("r"), "b", memory=4 * 10**9))
+    assert row.error is not None and row.error.startswith(said)
 
 
 @pytest.mark.parametrize("store", ["memory://fleet", "file://FOLDER/fleet"])
