@@ -24,11 +24,13 @@ from pykdtree.kdtree import KDTree
 
 from stitch.fusion.correspondence_weights import OffsetSums
 from stitch.fusion.register import prior_precision
+from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.distributions import tukey
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.units import length_text
 from stitch.observations.pose_errors import usual_twist
+from stitch.observations.surfaces.field_error import field_error
 from stitch.observations.surfaces.hand_eye_fit import Repeatability, hand_eye_jacobian, repeatability_from
 from stitch.observations.surfaces.matching import Match, match_pairs, sample_points
 from stitch.observations.surfaces.normal_equations import assemble
@@ -39,6 +41,7 @@ from stitch.screening.problems import SessionProblem
 from stitch.screening.snooping import Snooping
 from stitch.screening.view_model import view_model
 from stitch.session.capture import Capture
+from stitch.session.measurement import measurement_of
 from stitch.session.scan import Scan, Stock
 from stitch.session.session import SessionData
 
@@ -59,6 +62,8 @@ _LEAST_SCATTER = 0.5
 _SCALES_APART = 4 * np.sqrt(2)
 # Where more of the views stand off, no other says what their surface is.
 _MOST_OFF = 1 / 3
+# Level at which the scanner's errors, the same in all views, are unusual.
+_UNUSUAL = 0.01
 # Views that are asked: those that stand off, those whose overlaps keep a shape (in sigma of a distance, and in what
 # other views keep), those that an offset of the whole view would help by so many sigmas; no more than so many.
 _SHAPE, _TIMES_USUAL, _OFFSET, _MOST_ASKED = 0.5, 2.0, 4.0, 4
@@ -69,8 +74,8 @@ def find_stock(
 ) -> Mapping[int, Stock | None]:
     """Return the stock of the view that shows it most clearly; {} where none does.
 
-    Where too many have shown it one after the other, that is the scanner's error or the surface's: None for each from
-    which it was taken.
+    Where the scanner errs over its field in all views, or too many show it one after the other, it is none: None for
+    each from which it was taken.
 
     Args:
         T_mount: (4, 4) hand-eye under which `snooping` was made.
@@ -86,7 +91,8 @@ def find_stock(
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
-            return {view: stock} if len(taken) + 1 <= most else dict.fromkeys(taken)
+            error = field_error(measurement_of(session, capture), Model(T_mount), unconstrained, _UNUSUAL)
+            return dict.fromkeys(taken) if error.rms or len(taken) + 1 > most else {view: stock}
     return {}
 
 

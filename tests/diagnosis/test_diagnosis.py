@@ -223,7 +223,6 @@ def tilted(points):
 @pytest.mark.parametrize(
     "seen",
     [
-        pytest.param(lambda points: points * [1, 1, 1.01], id="longer", marks=pytest.mark.slow),
         pytest.param(lambda points: points + 0.01 * points[:, [1]] * [1, 0, 0], id="askew", marks=pytest.mark.slow),
         pytest.param(tilted, id="tilted"),
     ],
@@ -233,6 +232,16 @@ def test_a_scanner_of_bad_axes_or_focus_gets_no_name(measured, seen):
     assert found.verdict == "unknown_effect" and not found.effects
     assert "where in the scanner's field a point is seen" in found.sentence
     assert "pose errors dominate" not in found.sentence
+
+
+@pytest.mark.slow
+def test_a_range_axis_that_is_too_long_is_named_with_its_share(measured):
+    """z too long by 1 %: about the standoff that is a range that errs by 1 % of the way from there, and a shift."""
+    found = diagnosed(measured, lambda points: points * [1, 1, 1.01])
+    assert found.effects == ("range_nonlinearity",) and not any("stock" in doubt for doubt in found.doubts)
+    scored = found.named[0].score
+    slope = dict(zip([p.name for p in scored.form.free], scored.values, strict=True))["s"]
+    assert slope == pytest.approx(0.01 * found.linear.measurement.views.standoff, rel=0.1)
 
 
 def test_a_good_scanner_is_not_accused(measured):

@@ -20,6 +20,8 @@ from stitch.session.capture import Capture
 SAMPLES = 1500
 _MAXIMUM_ITERATIONS = 12
 _CONVERGED = 5e-3
+# Noise of a pair's scans that is so many times what is left between them is a shape, beyond what chance leaves of few.
+_MORE_THAN_LEFT = 2.0
 # The step (6V,) that was asked for, and the one that was taken, as displacements; None before the first.
 LastStep = tuple[Array, Array] | None
 
@@ -127,7 +129,7 @@ def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = Non
 
     σ of each view is measured in its own scan, across local quadrics; where the scans are too small
     for that, `stated` (scanner.noise of the session) stands in. Noise cannot leave more than what was left
-    once every view was free to move: where quadrics took a shape for noise, that is the floor.
+    once every view was free to move: where quadrics took a shape for noise, that is the floor, of a pair as of all.
 
     Args:
         overlaps: of the registered views.
@@ -137,6 +139,8 @@ def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = Non
     pairs = overlaps.gram.pairs[~overlaps.gram.labelled]
     count = overlaps.gram.count[~overlaps.gram.labelled]
     variance = sigma[pairs[:, 0]] ** 2 + sigma[pairs[:, 1]] ** 2
+    left = overlaps.gram.raw_square[~overlaps.gram.labelled] / np.maximum(count, 1)
+    variance = np.where(variance > _MORE_THAN_LEFT**2 * left, left, variance)
     measured = float(np.sqrt(np.average(variance, weights=np.maximum(count, 1))))
     spare = 1 - 6 * (len(sigma) - 1) / max(count.sum(), 1)
     return min(measured, overlaps.gram.rms / np.sqrt(spare)) if spare > 0 else measured
