@@ -222,7 +222,7 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
     with _tables(path, "effects", "[effects.joint_compliance.c2]; to fix: value, sigma, unit in each"):
-        return {
+        effects = {
             str(name): {
                 str(p): Parameter(
                     str(p),
@@ -235,6 +235,12 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
             }
             for name, parameters in table.items()
         }
+    for name, parameters in effects.items():
+        for p in parameters.values():
+            if not np.isfinite(p.value) or p.sigma < 0 or np.isinf(p.sigma):
+                number = f"effects.{name}.{p.name} is {p.value:g} with sigma {p.sigma:g}"
+                raise InputError(f"{path}: {number}; to fix: copy that of the run")
+    return effects
 
 
 def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:

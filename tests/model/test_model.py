@@ -225,3 +225,16 @@ def test_a_covariance_that_is_none_is_refused_in_a_line(tmp_path, at, value, mir
     with pytest.raises(InputError, match=r"hand_eye.covariance is not symmetric, or negative") as refused:
         read_model(file)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("value", "sigma"), [("1e-4", "-1e-5"), ("nan", "1e-5"), ("1e-4", "inf")])
+def test_a_number_of_an_effect_that_cannot_be_is_refused_in_a_line(tmp_path, value, sigma):
+    file = tmp_path / "model.toml"
+    write_model(ModelFile("mm", "eye_in_hand", np.eye(4), np.eye(4), np.eye(6)), file)
+    table = f'\n[effects.joint_offset.o1]\nvalue = {value}\nsigma = {sigma}\nunit = "rad"\n'
+    text = file.read_text("utf-8").replace("\n[effects]\n", "\n")
+    file.write_text(text + table, "utf-8")
+    with pytest.raises(
+        InputError, match=r"effects\.joint_offset\.o1 is .* with sigma .*; to fix: copy that of the run"
+    ):
+        read_model(file)

@@ -26,6 +26,7 @@ from stitch.plugins.intake.pose_tables import (
     with_one_header,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change
+from stitch.session.reading.announced_points import require_array_room
 from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from stitch.session.reading.text_files import WORKBOOKS, read_any_text, reason_of, require_file, workbook_sheets
 from stitch.session.reading.yaml_file import parse_yaml
@@ -331,7 +332,9 @@ def _from_json(file: Path, text: str) -> Any:
 def _from_numpy(file: Path) -> list[RawPoses]:
     try:
         arrays = _named_arrays(file)
-    except (ValueError, OSError, EOFError, NotImplementedError) as error:
+    except InputError as error:
+        raise Refusal(str(error).split("; to fix")[0], change(file, "save the poses alone")) from None
+    except Exception as error:  # whatever a library raises at bytes that are no arrays
         raise Refusal(f"{file}: cannot be read ({reason_of(error)})", change(file, "save plain numbers")) from None
     fitting = [(name, a) for name, a in arrays.items() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
     fitting.sort(key=lambda item: -item[1].ndim)
@@ -349,6 +352,7 @@ def _from_numpy(file: Path) -> list[RawPoses]:
 
 def _named_arrays(file: Path) -> dict[str, Array]:
     """Return the arrays of a .npy, .npz or .mat by name; MATLAB counts matrices by the last axis."""
+    require_array_room(file)
     if file.suffix.lower() != ".mat":
         loaded = np.load(file, allow_pickle=False)
         return {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}

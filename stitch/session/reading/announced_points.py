@@ -1,10 +1,13 @@
-"""How many points a scan's header announces, asked before a library makes room for them: LAS, E57, EXR, HDF5.
+"""How many points a scan's header announces, asked before a library makes room for them: LAS, E57, EXR, HDF5; and how
+large the arrays of MATLAB and NumPy are that are to hold poses.
 
 Layouts: LAS 1.4 R15 (ASPRS), tables 3 and 4; ASTM E2807, clause 6; OpenEXR, "The OpenEXR file layout".
 """
 
 import re
 import struct
+import zipfile
+import zlib
 from pathlib import Path
 
 from stitch.errors import InputError
@@ -20,7 +23,11 @@ _LAS_COUNT_14 = 247
 _E57_HEADER = 48
 _E57_XML = 24  # where the XML stands, how long it is, and the size of a page
 _E57_CHECKSUM = 4  # bytes at the end of a page
-_EXR_HEADER = 65536
+# The description stands before the pixels; texts in it are short.
+_EXR_HEADER = 1 << 20
+# Poses of a million views.
+_MOST_BYTES = 200_000_000
+_MAT_HEADER, _MAT_PACKED = 128, 15
 _EXR_WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
 
 
@@ -46,7 +53,7 @@ def require_las_room(path: Path) -> None:
         points = max(points, *struct.unpack_from("<Q", head, _LAS_COUNT_14))
     require_room(path, points)
     size = path.stat().st_size
-    if path.suffix.lower() == ".las" and points * length > size:
+    if path.suffix.lower() == ".las" and points * max(length, 1) > size:
         raise InputError(f"{path}: {points} points announced in {size} bytes; export it again")
 
 
@@ -65,14 +72,60 @@ def require_e57_room(path: Path) -> None:
     first = page - start % page
     pages = [raw[:first], *(raw[i : i + page] for i in range(first, len(raw), page))]
     text = b"".join(piece[:-_E57_CHECKSUM] for piece in pages)[:length]
-    require_room(path, max(map(int, re.findall(rb'recordCount\s*=\s*["\'](\d{1,20})', text)), default=0))
+    counts = re.findall(rb'recordCount\s*=\s*["\']\s*([^"\']*)', text)
+    # A number may be spelt by entities, a text by entities of entities.
+    if b"<!" in text.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or not all(count.isdigit() for count in counts):
+        raise InputError(f"{path}: its description has entities, or a number of points that is none; export it again")
+    require_room(path, max(map(int, counts), default=0))
 
 
 def require_exr_room(path: Path) -> None:
     """Refuse an OpenEXR image of more pixels than it can hold; see `require_room`."""
     with path.open("rb") as stream:
         head = stream.read(_EXR_HEADER)
-    at = head.find(_EXR_WINDOW) + len(_EXR_WINDOW)
-    if len(_EXR_WINDOW) <= at <= len(head) - 16:
+    windows = [found.end() for found in re.finditer(re.escape(_EXR_WINDOW), head) if found.end() <= len(head) - 16]
+    for at in windows:
         left, top, right, bottom = struct.unpack_from("<4i", head, at)
         require_room(path, max(right - left + 1, 0) * max(bottom - top + 1, 0))
+    if not windows:
+        raise InputError(f"{path}: has no dataWindow where the description of an OpenEXR stands; export it again")
+
+
+def require_array_room(path: Path) -> None:
+    """Refuse a .mat or .npz whose arrays take more room than tables of poses do, before it is made.
+
+    Raises:
+        InputError: with how many bytes are announced; what is no such file is left to its reader.
+    """
+    count = {".mat": _mat_bytes, ".npz": _npz_bytes}.get(path.suffix.lower())
+    if count is not None and (announced := count(path)) > _MOST_BYTES:
+        raise InputError(f"{path}: {announced} bytes of arrays announced; to fix: save the poses alone")
+
+
+def _mat_bytes(path: Path) -> int:
+    """Sum of the elements of a MAT-file of version 5, as they announce themselves inside where they are packed."""
+    total, size = 0, path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(_MAT_HEADER)
+        order = ">" if head[126:] == b"MI" else "<"
+        if head[126:] not in (b"MI", b"IM"):
+            return 0
+        while len(tag := stream.read(8)) == 8:
+            kind, count = struct.unpack(f"{order}II", tag)
+            after = stream.tell() + count
+            if kind == _MAT_PACKED:
+                try:
+                    _, unpacked = struct.unpack(f"{order}II", zlib.decompressobj().decompress(stream.read(64), 8))
+                except (zlib.error, struct.error):
+                    return total
+                total += unpacked
+            stream.seek(min(after, size))
+    return max(total, size)
+
+
+def _npz_bytes(path: Path) -> int:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, OSError):
+        return 0

@@ -2,12 +2,16 @@
 
 import struct
 import time
+import zipfile
+import zlib
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from stitch.errors import InputError
 from stitch.session.reading.announced_points import (
+    require_array_room,
     require_e57_room,
     require_exr_room,
     require_las_room,
@@ -88,6 +92,44 @@ def test_an_image_that_announces_too_much_is_refused_before_it_is_decoded(tmp_pa
     (tmp_path / "d.exr").write_bytes(exr(1_000_000, 1_000_000))
     with pytest.raises(InputError, match="1000000000000 points announced"):
         require_exr_room(tmp_path / "d.exr")
+    # A first window that is small, and one that stands far behind.
+    small, large = exr(4, 4)[:-1], exr(1_000_000, 1_000_000)[8:]
+    text = b"pad\0string\0" + struct.pack("<I", 70_000) + bytes(70_000)
+    (tmp_path / "d.exr").write_bytes(small + text + large)
+    with pytest.raises(InputError, match="1000000000000 points announced"):
+        require_exr_room(tmp_path / "d.exr")
+
+
+@pytest.mark.parametrize("number", [b"&#49;000000000000", b"&many;", b"-5", b""])
+def test_a_number_of_points_that_is_spelt_otherwise_is_refused(tmp_path, number):
+    (tmp_path / "s.e57").write_bytes(e57(10).replace(b'"10"', b'"' + number + b'"'))
+    with pytest.raises(InputError, match="number of points that is none"):
+        require_e57_room(tmp_path / "s.e57")
+
+
+@pytest.mark.parametrize("kind", ["mat", "npz", "mat of zeros"])
+def test_arrays_that_are_packed_a_thousand_times_are_refused_before_they_are_unpacked(tmp_path, kind):
+    file = tmp_path / f"poses.{kind[:3]}"
+    small = np.tile(np.eye(4), (100, 1, 1))
+    if kind == "mat":
+        inside = struct.pack("<II", 14, 2_000_000_000) + bytes(1000)
+        packed = zlib.compress(inside)
+        savemat(file, {"T": small})
+        file.write_bytes(file.read_bytes() + struct.pack("<II", 15, len(packed)) + packed)
+    elif kind == "npz":
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for k in range(3):
+                archive.writestr(f"{k}.npy", bytes(80_000_000))
+    else:
+        savemat(file, {"T": np.zeros((4, 4, 2_000_000))}, do_compression=True)
+    began = time.perf_counter()
+    with pytest.raises(InputError, match="bytes of arrays announced"):
+        require_array_room(file)
+    assert time.perf_counter() - began < 1.0
+    savemat(tmp_path / "small.mat", {"T": small}, do_compression=True)
+    np.savez_compressed(tmp_path / "small.npz", T=small)
+    require_array_room(tmp_path / "small.mat")
+    require_array_room(tmp_path / "small.npz")
 
 
 def test_what_a_file_can_hold_passes(tmp_path):
