@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.ranking import Ranked
-from stitch.diagnosis.systematic_laws import STEP, Law, Span, dictionary_of
+from stitch.diagnosis.systematic_laws import STEP, Dictionary, Law, Span, dictionary_of
 from stitch.diagnosis.thresholds import DEPENDENCE_BINS, FAINT_SIGMAS
+from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space, fit_columns
@@ -28,6 +29,8 @@ _AS_WELL = 20.0
 _NEW_SHARE, _NOTHING = 1e-4, 1e-9
 # Covariates that correlate but for so little are one.
 _ALIKE = 1e-9
+# Laws of each covariate whose own degrees of freedom of the scatter are asked, the clearest (time).
+_ASKED_OF_EACH = 4
 # Laws whose scatter is fitted anew, the clearest, and of more numbers than these (time).
 _REFITTED, _FEW_NUMBERS, _REFITTED_OF_MANY = 12, 400, 3
 
@@ -66,18 +69,23 @@ def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
     return tuple(x for x in followed if x.clear and x.p_beside < FOLLOWS)
 
 
-def dependences(linear: LinearModel, named: Sequence[Ranked] = ()) -> tuple[Dependence, ...]:
+def dependences(
+    linear: LinearModel, named: Sequence[Ranked] = (), dictionary: Dictionary | None = None
+) -> tuple[Dependence, ...]:
     """Find what the displacements of whole views follow, clearest first; () where too few numbers are free.
 
     Args:
         named: effects that are said to be missing: of columns that are one in these views, theirs is listed alone.
+        dictionary: of these views, where it is known.
     """
     linear = linear.restricted(())
-    laws = [law for law in dictionary_of(linear).laws if law.is_whole]
-    if not laws:
+    whole = (dictionary or dictionary_of(linear)).whole_laws()
+    if not whole:
         return ()
-    columns = [law.reduced(linear.observation) for law in laws]
-    p_values = _p_values(linear, columns)
+    laws, columns = zip(*whole, strict=True)
+    clearest = _may_be_clearest(linear, laws, columns)
+    p_values = np.ones(len(laws))
+    p_values[clearest] = _p_values(linear, [columns[k] for k in clearest])
     alike = _followed_alike(laws, columns, named)
     best: dict[str, int] = {}
     for k in np.argsort(p_values, kind="stable"):
@@ -93,6 +101,20 @@ def dependences(linear: LinearModel, named: Sequence[Ranked] = ()) -> tuple[Depe
         _dependence(linear, laws[k], columns[k], displacement, tried * p_values[k], tried * beside.get(k, 1.0))
         for k in best.values()
     )
+
+
+def _may_be_clearest(linear: LinearModel, laws: Sequence[Law], columns: Sequence[Array]) -> list[int]:
+    """Return the few laws of each covariate that explain most, as if all scatter were known alike."""
+    known = linear.mixed.size - linear.design.shape[1]
+    by_driver: dict[str, list[tuple[float, int]]] = {}
+    for k, (information, vector) in enumerate(linear.information([SelectedColumns(X) for X in columns])):
+        values, vectors = np.linalg.eigh(information)
+        seen = values > _NEW_SHARE**2 * max(values[-1], _NOTHING)
+        rank = int(seen.sum())
+        square = float(np.sum((vectors[:, seen].T @ vector) ** 2 / values[seen]))
+        chance = f_tail(square / rank, rank, max(known, 1)) if rank else 1.0
+        by_driver.setdefault(laws[k].driver.name, []).append((chance, k))
+    return [k for chances in by_driver.values() for _, k in sorted(chances)[:_ASKED_OF_EACH]]
 
 
 def _followed_alike(laws: Sequence[Law], columns: Sequence[Array], named: Sequence[Ranked]) -> set[str]:

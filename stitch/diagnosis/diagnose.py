@@ -85,7 +85,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         translation=translation,
         candidates=tuple(examined),
         matrix=matrix,
-        depends_on=dependences(linear, evidence.named),
+        depends_on=dependences(linear, evidence.named, evidence.dictionary),
         missing=missing,
         linear=linear,
         notes=evidence.notes,

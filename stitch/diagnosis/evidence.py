@@ -110,6 +110,7 @@ def _propose_names(case: Case, limit: ScatterLimit) -> Evidence:
         ranked,
         empirical,
         laws=laws,
+        dictionary=case.dictionary,
         implausible_scatter=implausible(case.linear, limit),
         beyond_expected=beyond_expected(case.linear, expected_scatter(case.linear, limit)),
     )

@@ -108,15 +108,18 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     observable = observable or bool(likely.max() > limits.LOG_BAYES_FACTOR)
     least = max(regime.least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
-    likeliest = np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted]
+    weights = form_weights(candidate)
+    # What cannot gain is fitted once, for its size.
+    hopeless = regime.prior and logsumexp(likely + np.log(weights)) < -limits.REFIT_GAIN_WITH_PRIOR
+    shown = [i for i in np.argsort(-likely, kind="stable") if candidate.forms[i].columns.any()]
+    likeliest = shown[: 1 if hopeless else regime_of(linear).forms_refitted]
     trials = [FormTrial(float(gain)) for gain in likely]
     for i in sorted(likeliest):
         form = candidate.forms[i]
-        if likely[i] >= least and form.columns.any():
+        if likely[i] >= least:
             variances = starts[best_start[i]].null.variances if start is None else start
             trials[i] = try_form(base, form, variances, at_starts[best_start[i]][0][i][1])
-    weights = form_weights(candidate)
-    k = max(range(len(trials)), key=lambda i: trials[i].log_bayes_factor)
+    k = max(range(len(trials)), key=lambda i: (trials[i].values is not None, trials[i].log_bayes_factor))
     best = trials[k]
     form = candidate.forms[k]
     log_shares = np.array([trial.log_bayes_factor for trial in trials]) + np.log(weights)

@@ -11,7 +11,8 @@ A place and what it follows are one law, each as likely before as any other; its
 at the variances of the model, the likeliest few with all variances anew (`score.try_form`), as effects are.
 
 A law that an effect of the library or of a user says too is no rival of it: it is that effect, by its name. What turns
-the first joint turns the base about its axis, and the last one what the flange carries; they are one place.
+the first joint turns the base about its axis, and the last one what the flange carries; they are one place. So is a
+link whose growth moves part or base as a whole.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +37,7 @@ from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel, Observation
 from stitch.observations.pose_errors import usual_twist
-from stitch.session.measurement import Views
+from stitch.session.measurement import TEMPERATURES, Views
 from stitch.session.robot import Links
 
 TIME = "time_s"
@@ -70,6 +71,8 @@ _STILL = np.radians(2.0)
 _JOINT = 4e-4
 # The same of a link's lengths: steel by 17 °C.
 _GROWN = 2e-4
+# Share of a law by which a link's length follows anything but warmth and time (judgement).
+_SELDOM_GROWS = 0.1
 # Draws of what chance makes of the clearest law, their seed; by-count chances beyond which none is clear, and numbers
 # among which there is no time to draw.
 _DRAWS, _SEED = 499, 20
@@ -140,6 +143,12 @@ class Law:
         """(k·R,) usual sizes."""
         return np.outer(self.place.sizes[self.columns], 0.5 ** np.arange(self.shapes.shape[1])).ravel()
 
+    @property
+    def among(self) -> Indices:
+        """(k·R,) which of the columns of all axes of the place are its own."""
+        shapes = self.shapes.shape[1]
+        return (shapes * self.columns[:, None] + np.arange(shapes)).ravel()
+
     def reduced(self, observation: Observation) -> Array:
         """(n, k·R) columns of the reduced observations."""
         moved = self.place.twists[:, :, self.columns, None] * self.shapes[:, None, None, :]
@@ -199,6 +208,11 @@ class Dictionary:
             if held is None and columns.nbytes < _HELD / len(self.stems):
                 self._held[stem] = columns
             yield stem, index, columns
+
+    def whole_laws(self) -> list[tuple[Law, Array]]:
+        """Return the laws of all six numbers, or of a joint or link, with their columns (n, k·R)."""
+        laws = ((self.laws[i], columns) for _, index, columns in self.columns() for i in index)
+        return [(law, columns[:, law.among]) for law, columns in laws if law.is_whole]
 
     @cached_property
     def _held(self) -> dict[Law, Array]:
@@ -391,10 +405,9 @@ def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
     held = list(dictionary.columns())
     sums = linear.information([SelectedColumns(columns) for _, _, columns in held])
     by_size: dict[int, list[tuple[int, Array, Array]]] = {}
-    for (stem, index, _), (information, vector) in zip(held, sums, strict=True):
-        shapes = stem.shapes.shape[1]
+    for (_, index, _), (information, vector) in zip(held, sums, strict=True):
         for i in index:
-            some = (shapes * dictionary.laws[i].columns[:, None] + np.arange(shapes)).ravel()
+            some = dictionary.laws[i].among
             by_size.setdefault(len(some), []).append((i, information[some[:, None], some], vector[some]))
     for sets in by_size.values():
         k, turned = np.linalg.eigh(np.array([information for _, information, _ in sets]))
@@ -422,11 +435,13 @@ def _places(linear: LinearModel) -> Iterator[Place]:
         names = ("the part on the flange", "the scanner's stand or the base")
     else:
         names = ("the part or the base", "the scanner or its mount")
+    bodies = list[Array]()
     about_centre = np.broadcast_to(np.eye(6)[:, :3], (count, 6, 3))
     for name, kind, carried in zip(names, ("part", "mount"), (still, capture.T_reference_mount), strict=True):
         moved = frames.adjoint(to_centre @ carried)
         axes = moved[:, :3, :3]
         about = np.concatenate([axes, np.zeros_like(axes)], axis=1) if kind == "mount" else about_centre
+        bodies.append(moved.reshape(-1, 6))
         yield Place(name, np.concatenate([moved, about], axis=2), sizes, np.arange(6), units, kind=kind)
     if measurement.views.joints.shape[1] and measurement.robot is not None:
         terms = [term_of(measurement, effect) for effect in (EFFECTS["joint_offset"], _LENGTHS)]
@@ -435,7 +450,8 @@ def _places(linear: LinearModel) -> Iterator[Place]:
         for k, (turned, grown) in enumerate(zip(of_joints, of_links, strict=True)):
             end = ends.get(k, "")
             yield Place(f"joint {k + 1}{end}", turned[..., None], np.array([_JOINT]), np.arange(1), ("rad",), k + 1)
-            if np.abs(grown).max() * _GROWN > usual[-1] / 10:
+            moves_a_body = any(Span(body).contains(Span(grown.reshape(-1, 1))) for body in bodies)
+            if np.abs(grown).max() * _GROWN > usual[-1] / 10 and not moves_a_body:
                 size = np.array([_GROWN])
                 yield Place(f"link {k + 1}{end}", grown[..., None], size, np.arange(1), ("1",), kind="links")
 
@@ -515,7 +531,8 @@ def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
             yield Law(place, driver, shape, place.whole, centred=True), shares / 2
             continue
         if place.kind == "links":
-            yield Law(place, driver, shape, place.whole), shares
+            grows = driver.name == TIME or driver.name in TEMPERATURES
+            yield Law(place, driver, shape, place.whole), shares * (1.0 if grows else _SELDOM_GROWS)
             continue
         axes = np.arange(place.twists.shape[2])
         for columns in (place.whole, *axes.reshape(-1, 3), *axes.reshape(-1, 1)):
@@ -535,10 +552,14 @@ class Span:
 
     def contains(self, other: "Span") -> bool:
         """Return whether the other's columns are combinations of these."""
-        if not self.columns.any():
+        if not self.square or not other.square:
             return False
-        left = other.columns - self.basis @ (self.basis.T @ other.columns)
-        return bool(other.columns.any() and np.sum(left**2) < (1 - _SAME) * np.sum(other.columns**2))
+        return float(np.sum((self.basis.T @ other.columns) ** 2)) > _SAME * other.square
+
+    @cached_property
+    def square(self) -> float:
+        """Sum of squares of the columns."""
+        return float(np.sum(self.columns**2))
 
 
 def _whole_forms(candidate: Candidate) -> list[Span]:

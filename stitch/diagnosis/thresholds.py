@@ -44,6 +44,7 @@ LONG = 250
 # Nats: forms that lose so many under the null's variances do not gain under their own either; under several variances,
 # of which one is nearly that of the maximum, they gain half a nat at the most.
 HOPELESS_GAIN, HOPELESS_GAIN_WITH_PRIOR = -4.0, -1.5
+REFIT_GAIN_WITH_PRIOR = 0.5
 # Numbers times forms that are fitted for a candidate (some seconds). With thousands of numbers the variances hardly
 # move, and each fit takes a second: the best forms must do.
 REFITTED_NUMBERS, FORMS_REFITTED_WITH_MANY_NUMBERS = 20_000, 2

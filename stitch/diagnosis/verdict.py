@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.ranking import Ranked, stands_out
-from stitch.diagnosis.systematic_laws import law_of
+from stitch.diagnosis.systematic_laws import Dictionary, law_of
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.diagnosis.validation import CrossValidation
 from stitch.observations.linear_model import LinearModel
@@ -57,6 +57,7 @@ class Evidence:
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
     coincidence: str = ""  # why a jump in time cannot be told from an error of a joint that turns back
     answers: tuple[Answer, ...] = ()  # of the questions that led here, in the order they were asked
+    dictionary: Dictionary | None = None  # of all laws that were asked
     # What questions hand on to the next: the likeliest shape without a cause, where it is enough for an alarm,
     shape: Ranked | None = None
     # effects that could be named, likeliest first,
