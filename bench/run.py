@@ -29,6 +29,7 @@ TABLES = {
     "diagnose-time": "speed:DIAGNOSE",
     "doors": "doors:TABLE",
     "drilling": "drilling:TABLE",
+    "driven": "drive:TABLE",
     "expected-scatter": "laws_everywhere:SCATTER",
     "expected-chances": "metrology:CHANCES",
     "faults": "faults:TABLE",

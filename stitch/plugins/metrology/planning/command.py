@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 
 from stitch.cli.options import Json, Trust
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_block, show_table, stdout_for_results
+from stitch.cli.terminal import emit, say, show_block, show_next, show_table, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,6 +58,16 @@ _Output = Annotated[
 ]
 
 
+_Drive = Annotated[
+    str | None,
+    typer.Option("--drive", metavar="COMMAND", help="Takes a view: gets its pose as JSON, writes the scan."),
+]
+_UntilU = Annotated[
+    float | None, typer.Option("--until-U", metavar="LENGTH", help="With --drive: U at the part to reach, length_unit.")
+]
+_DriveSeconds = Annotated[float, typer.Option("--drive-seconds", help="After which COMMAND is ended.")]
+
+
 @stdout_for_results
 def plan_views(
     folder: _Folder,
@@ -69,6 +80,9 @@ def plan_views(
     field: _Field = None,
     start: _Start = None,
     output: _Output = None,
+    drive: _Drive = None,
+    until_U: _UntilU = None,
+    drive_seconds: _DriveSeconds = 120.0,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
@@ -79,6 +93,7 @@ def plan_views(
       stitch plan blade-18 --size 300
       stitch plan blade-18 --part blade.stl --split joint_compliance gear_eccentricity -o more
       stitch plan runs/blade-17 --halve
+      stitch plan blade-18 --size 300 --start 0,-90,90,0,45,0 --drive ./cell.sh --until-U .05
     """
     from stitch.output.json_file import to_json
     from stitch.output.session_files import whole_folder, write_table
@@ -86,6 +101,10 @@ def plan_views(
     from stitch.plugins.metrology.planning.plan_document import plan_document, view_columns
 
     _require_plan_options(views, size, field, output)
+    if drive is not None or until_U is not None:
+        odd = [name for name, value in {"--split": split, "--for": feature, "-o": output}.items() if value]
+        _drive_cell(folder, drive, until_U, drive_seconds, views, odd, (part, size, field, start), as_json)
+        return
     wanted = _plan_request(views, split, halve, place_of(folder, feature))
     wanted = replace(wanted, poses=_deciding_poses(folder, split))
     stated = {"part": part, "size": size, "field": field, "start": start}
@@ -107,6 +126,58 @@ def plan_views(
         emit(to_json(document))
     else:
         _show_plan(plan, planned.cell, output)
+
+
+def _drive_cell(
+    folder: Path,
+    command: str | None,
+    until_U: float | None,
+    seconds: float,
+    most: int | None,
+    odd: list[str],
+    stated: tuple[Path | None, float | None, float | None, str | None],
+    as_json: bool,
+) -> None:
+    """Take views by a command until U is reached; print each, and what to do next."""
+    import shlex
+
+    import numpy as np
+
+    from stitch.numerics.units import length_text
+    from stitch.output.json_file import to_json
+    from stitch.plugins.metrology.planning.drive import DrivenCell, drive
+    from stitch.session.reading.session_folder import load_session
+
+    if command is None or until_U is None or not until_U > 0 or not seconds > 0:
+        raise InputError("--drive COMMAND and --until-U LENGTH go together, above zero; to fix: give both")
+    if odd or not (folder / "session.toml").is_file():
+        raise InputError(
+            f"--drive: {odd[0] if odd else folder} is not for it; to fix: a session's folder, without {odd}"
+        )
+    part, size, field, start = stated
+    joints = None if start is None else np.radians(_option_numbers("--start", start, "joint angles (°)"))
+    if joints is None and not (folder / "views.csv").is_file():
+        raise InputError(f"{folder}: no view yet; to fix: --start J1,J2,… in degrees, where the scanner sees the part")
+    unit = load_session(folder, scans=False, start=joints).length_unit
+    taken: list[tuple[int, float | None]] = []
+
+    def tell(views: int, U: float | None) -> None:
+        taken.append((views, U))
+        if not as_json:
+            say(f"{views} views: U at the part {'not known yet' if U is None else length_text(U, unit, 2)}")
+
+    try:
+        drive(DrivenCell(folder, part, size, field, joints, most or 40), until_U, command, seconds, tell)
+    except (KeyboardInterrupt, Exception):
+        say(f"{folder} holds what was scanned; the same call goes on from there", stream=sys.stderr)
+        raise
+    views, U = taken[-1] if taken else (0, None)
+    reached = U is not None and until_U >= U
+    if as_json:
+        emit(to_json({"views": views, "U_at_part": U, "reached": reached, "steps": taken}))
+        return
+    say("U is reached." if reached else "No further view within reach brings more.", bold=True)
+    show_next(f"Next: stitch run {shlex.quote(str(folder))}")
 
 
 def _deciding_poses(folder: Path, split: tuple[str, str] | None) -> Array | None:

@@ -52,6 +52,8 @@ _NEARLY = 0.95
 _SWEEPS = 2
 # Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
 _MIN_PRESENT_VIEWS = 3
+# A joint's way from a pose out of reach to one that may be in reach, rad.
+_NEAR_REFUSED = 0.1
 # Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
 _TRIED = 40
 _MORE = 6
@@ -261,6 +263,7 @@ class PlanRequest:
     views: int | None = None  # at the most
     feature: Array | None = None  # (3,) reference frame; or (6,) with the direction that counts
     poses: Array | None = None  # (K, n) rad that a diagnosis proposes for this very pair: no others are sought
+    refused: Array | None = None  # (K, n) rad that the arm cannot reach: nothing near them is tried
 
     @property
     def place(self) -> Array | None:
@@ -346,6 +349,23 @@ def plan_further_views(session: SessionData, planned: PlannedCell, request: Plan
         )
 
 
+def best_further_view(session: SessionData, planned: PlannedCell, refused: Sequence[Array] = ()) -> Array | None:
+    """Return joints (n,) rad of the one further view that makes the hand-eye surest; None where none does.
+
+    Args:
+        refused: joints (n,) that the arm cannot reach.
+
+    Raises:
+        NoResultError: views that would not see the part.
+    """
+    errors = planned.fitted_scatter
+    request = PlanRequest(split_any=False, views=1, refused=np.array(refused) if refused else None)
+    with library_threads_off():
+        scatter = errors.believed if errors else planned.cell.scatter
+        _, chosen, joints = _search_views(session, planned.cell, scatter, None, request)
+    return joints[0] if chosen else None
+
+
 def _search_views(
     session: SessionData, cell: CellModel, scatter: Scatter, now: Outlook | None, request: PlanRequest
 ) -> tuple[list[Goal], list[int], Array]:
@@ -360,6 +380,8 @@ def _search_views(
     goals, chosen, joints = list[Goal](), list[int](), session.joints[:0]
     for _ in range(1 if request.feature is None else 1 + _CLOSER):
         tried = np.vstack([joints, candidate_joints(session, cell, _TRIED, joints if chosen else None)])
+        if request.refused is not None:
+            tried = tried[np.abs(tried[:, None] - request.refused).max(axis=2).min(axis=1) > _NEAR_REFUSED]
         if not len(tried):
             break
         every = with_views(session, list(tried), in_turn=False)
