@@ -19,7 +19,7 @@ from starlette.applications import Starlette
 from starlette.background import BackgroundTask
 from starlette.datastructures import Headers
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -28,65 +28,16 @@ from stitch.errors import InputError, StitchError
 from stitch.output.stored_run import read_documents
 from viz.page_parts import render
 from viz.review.chosen_field import Choice
+from viz.review.first_run import FirstRun
 from viz.review.jobs import Busy, Job, Jobs, News
+from viz.review.json_answers import LARGEST_BODY, error_response, fault, json_object, json_response, refusal_response
 from viz.review.rerun_viewer import NAMES, RerunViewer
 from viz.review.run_review import RunReview
-
-# Answers as JSON, and requests that bring it.
-
-
-async def json_object(request: Request) -> dict[str, Any] | None:
-    """The JSON object of a request; None where it brings something else: too much, too deep, no number or no text."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > LARGEST_BODY:
-            return None
-    try:
-        found = json.loads(body)
-        # Half an emoji is no text of a command, nor is 1e400 a number.
-        json.dumps(found, allow_nan=False, ensure_ascii=False).encode()
-    except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
-def json_response(value: Any) -> Response:
-    """Plain data; what is not known is null."""
-    return JSONResponse(_finite(value))
-
-
-def error_response(text: str, status: int = 400) -> Response:
-    """One line for the page."""
-    return JSONResponse({"problem": text}, status_code=status)
-
-
-def refusal_response(error: Exception) -> Response:
-    """Return the message of a refused input."""
-    return error_response(str(error), 422)
-
-
-async def fault(_: Request, error: Exception) -> Response:
-    """A fault of the program: one line for the page and the terminal."""
-    text = f"unexpected {type(error).__name__}: {error}; a fault of stitch"
-    print(f"stitch: {text}", file=sys.stderr, flush=True)
-    return error_response(text, 500)
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and value - value != 0 else value
-
 
 # Who may ask: a browser on this machine that knows the token; and what a page of ours may load.
 
 # A name that resolves to 127.0.0.1 may belong to somebody else (DNS rebinding).
 HOSTS = ("127.0.0.1", "localhost")
-LARGEST_BODY = 200_000  # bytes
 _PAGE = (
     "default-src 'none'; script-src 'self'; style-src 'nonce-{nonce}'; img-src 'self' data:; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -248,8 +199,8 @@ _RECORDING = "recording.rrd"
 class ReviewPages:
     """Answers that change nothing; those that read files run beside the event loop."""
 
-    def __init__(self, review: RunReview, jobs: Jobs, news: News, nonce: str) -> None:
-        self.review, self.jobs, self.news, self.nonce = review, jobs, news, nonce
+    def __init__(self, review: RunReview, jobs: Jobs, news: News, nonce: str, first: FirstRun | None) -> None:
+        self.review, self.jobs, self.news, self.nonce, self.first = review, jobs, news, nonce, first
         self.viewer = RerunViewer()
 
     @property
@@ -269,6 +220,8 @@ class ReviewPages:
 
     def page(self, request: Request) -> Response:
         """The page, without numbers: its scripts ask for them."""
+        if self.first is not None and not (self.review.run / "result.json").is_file():
+            return HTMLResponse(render("first_run.html.j2", nonce=self.nonce, folder=self.first.folder.name))
         return HTMLResponse(render("review.html.j2", nonce=self.nonce, run=self.review.run.name))
 
     def state(self, request: Request) -> Response:
@@ -345,12 +298,17 @@ def _choice(asked: dict[str, Any]) -> Choice:
 _LOOK = 0.5
 
 
-def review_app(review: RunReview, token: str, nonce: str) -> ASGIApp:
-    """The application, which answers below /TOKEN/ alone."""
+def review_app(review: RunReview, token: str, nonce: str, scans: Path | None = None) -> ASGIApp:
+    """The application, which answers below /TOKEN/ alone.
+
+    Args:
+        scans: folder of which there is no run yet; the review begins once there is.
+    """
     news = News()
     jobs = Jobs(news.tell, lambda: review.model)
-    pages = ReviewPages(review, jobs, news, nonce)
-    routes = [*pages.routes, *ReviewActions(review, jobs, news).routes]
+    first = None if scans is None else FirstRun(scans, review.run, jobs)
+    pages = ReviewPages(review, jobs, news, nonce, first)
+    routes = [*pages.routes, *ReviewActions(review, jobs, news).routes, *(first.routes if first else ())]
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -383,13 +341,27 @@ _HERE = "127.0.0.1"
 _GRACE = 1
 
 
-def serve_review(run: Path, port: int, *, browser: bool, effects_file: Path | None, trust: bool) -> None:
+def serve_review(
+    folder: Path, output: Path | None, port: int, *, browser: bool, effects_file: Path | None, trust: bool
+) -> None:
     """Serve until Ctrl-C.
 
+    Args:
+        folder: of a run, or of scans or a session that are run first.
+        output: run folder of scans; None: `runs/NAME`.
+
     Raises:
-        InputError: no run, no such file of effects, or a port that is taken.
+        InputError: no such folder or file of effects, a run of these scans that is there already, or a port that is
+            taken.
     """
-    read_documents(run)
+    scans = folder if folder.is_dir() and not (folder / "result.json").exists() else None
+    run = folder if scans is None else output or Path("runs") / folder.resolve().name
+    if scans is None:
+        read_documents(run)
+    elif (run / "result.json").exists():
+        raise InputError(f"{run}: a run is there; to fix: `stitch review {run}`, or name another with -o")
+    elif not any(scans.iterdir()):
+        raise InputError(f"{scans}: an empty folder; to fix: name a run, a session, or scans with their poses")
     if effects_file is not None and not effects_file.is_file():
         raise InputError(f"{effects_file}: no such file; --effects-file names a Python file with @effect functions")
     token, nonce = secrets.token_urlsafe(24), secrets.token_urlsafe(16)
@@ -397,7 +369,7 @@ def serve_review(run: Path, port: int, *, browser: bool, effects_file: Path | No
     address = f"http://{_HERE}:{listening.getsockname()[1]}/{token}/"
     found = RunReview(run.resolve(), None if effects_file is None else effects_file.resolve(), trust)
     config = uvicorn.Config(
-        review_app(found, token, nonce),
+        review_app(found, token, nonce, scans),
         log_level="critical",
         access_log=False,
         server_header=False,
