@@ -339,11 +339,12 @@ def plan_further_views(session: SessionData, planned: PlannedCell, request: Plan
             # Views that would make it no better than it is are none to take.
             return empty
         split = next((goal.names for goal in goals if isinstance(goal, SplitPair)), None)
+        ends = None if now is None else now.hand_eye.U, after.hand_eye.U
         place_now = next((goal.now for goal in goals if isinstance(goal, KnownPlace) and np.isfinite(goal.now)), None)
         return replace(
             empty,
             split=split,
-            proposed=_proposed_views(goals, chosen, further, None if request.feature is not None else after.hand_eye.U),
+            proposed=_proposed_views(goals, chosen, further, None if request.feature is not None else ends),
             after=after,
             place_now=None if request.feature is None else place_now,
         )
@@ -441,18 +442,23 @@ def _hardest_pair_goal(views: PossibleViews, now: Outlook) -> list[Goal]:
 
 
 def _proposed_views(
-    goals: Sequence[Goal], chosen: Sequence[int], further: SessionData, U_after: float | None
+    goals: Sequence[Goal],
+    chosen: Sequence[int],
+    further: SessionData,
+    ends: tuple[float | None, float] | None,
 ) -> tuple[ProposedView, ...]:
     """Return what the views bring one after the other.
 
     Args:
-        U_after: of the hand-eye with all of them, of their whole scans; the search has thinner ones. None: of a place.
+        ends: U of the hand-eye before them, if known, and with all, of whole scans and of the fit that a run does; the
+            search has thinner ones and weighs as it knows the arm, and says what share each brings. None: of a place.
     """
     present, out = len(further.views) - len(chosen), list[ProposedView]()
+    start = next((goal.now for goal in goals if isinstance(goal, KnownPlace)), float("nan"))
     reported = reported_poses(further)
     for k, view in enumerate(further.views[present:]):
-        before = further.views[present + k - 1].joints
-        assert view.joints is not None and before is not None
+        from_here = further.views[present + k - 1].joints
+        assert view.joints is not None and from_here is not None
         views = [*range(present), *chosen[: k + 1]]
         U, apart = float("nan"), float("nan")
         for goal in goals:
@@ -461,8 +467,14 @@ def _proposed_views(
                 U = float(goal.U(normal))
             else:
                 apart = float(goal.progress(normal))
-        travel = float(np.abs(view.joints - before).max())
+        travel = float(np.abs(view.joints - from_here).max())
         T = reported[present + k]
         out.append(ProposedView(view.name, view.joints, T, travel=travel, U=U, separated_share=apart))
-    scale = 1.0 if U_after is None else U_after / out[-1].U
-    return tuple(replace(view, U=scale * view.U) for view in out)
+    if ends is None:
+        return tuple(out)
+    before, after = ends
+    last = out[-1].U
+    if before is None or not last < start:
+        return tuple(replace(view, U=after / last * view.U) for view in out)
+    shares = [np.log(view.U / start) / np.log(last / start) for view in out]
+    return tuple(replace(v, U=float(before * (after / before) ** share)) for v, share in zip(out, shares, strict=True))

@@ -151,6 +151,8 @@ def test_before_any_scan_it_says_what_views_tell_and_which_to_add(planned, measu
     assert {"intensity_bias", "latency"} == set(told["now"]["not_asked"])
     # The poses are those of another kinematics at these joints, and the table can be driven and planned from.
     assert 0 < len(told["proposed"]) <= 3
+    U = [told["now"]["hand_eye"]["U_at_part"], *(view["U_at_part"] for view in told["proposed"])]
+    assert max(np.diff(U)) <= 0 and U[-1] == pytest.approx(told["after"]["hand_eye"]["U_at_part"])
     shutil.copy(planned / "s" / "session.toml", planned / "more")
     again = load_session(planned / "more", scans=False)
     for view, row in zip(again.views, told["proposed"], strict=True):
