@@ -107,7 +107,7 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
         views,
         count=views.count + more.count,
         velocity=None if views.velocity is None else joined("velocity"),
-        torques=replace(views.torques, values=np.concatenate([views.torques.values, more.torques.values])),
+        torques=views.torques.followed_by(more.torques),
         covariates={name: np.append(values, more.covariates[name]) for name, values in views.covariates.items()},
         joints=joined("joints"),
         previous=joined("previous"),
@@ -128,7 +128,7 @@ def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
     views."""
     if views.torques.measured:
         near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
-        return replace(views.torques, values=views.torques.values[near])
+        return views.torques.only(near)
     carried = views.covariates.get(PAYLOAD)
     return torques_of(robot, joints, None if carried is None else np.full(len(joints), carried[-1]))
 

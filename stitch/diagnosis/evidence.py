@@ -31,7 +31,7 @@ from stitch.diagnosis.ranking import (
     too_large,
 )
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, score
+from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, promising, score
 from stitch.diagnosis.sensitivity import imitated_share
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
 from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
@@ -167,6 +167,8 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
         contenders = sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior)
+    hidden = _hidden_contenders(case, base, evidence.ranked)
+    contenders = [*contenders, *hidden.values()]
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
     contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
@@ -182,9 +184,30 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         "contenders": tuple(contenders),
         "base": base,
         "unmodelled_log_posterior": unmodelled,
-        "ranked": rescored_against(evidence.ranked, best, unmodelled),
+        "ranked": rescored_against(_with_hidden(evidence.ranked, hidden), best, unmodelled),
     }
     return Reply(best.name, changes)
+
+
+def _hidden_contenders(case: Case, base: LinearModel, ranked: Sequence[Ranked]) -> dict[str, Ranked]:
+    """Return effects, by name, that could be named only where no contender is among the errors that remain: a base that
+    gives way explains nothing beside joints that may give way by as much as the views show."""
+    if base is case.linear:
+        return {}
+    weak = {r.name for r in ranked if not is_contender(r)} - base.causes
+    likely = promising(base, [c for c in case.candidates if c.name in weak], limits.CANDIDATES_TRIED)
+    again = rank([score(base, candidate) for candidate, _ in likely], len(ranked))[0]
+    return {r.name: r for r in again if is_contender(r)}
+
+
+def _with_hidden(ranked: Sequence[Ranked], hidden: Mapping[str, Ranked]) -> tuple[Ranked, ...]:
+    """Return the ranking with these as they are scored now; posterior shares make room for them."""
+    first = ranked[0]
+    for r in hidden.values():
+        ranked = rescored_against(ranked, first, r.log_posterior)
+    share = ranked[0].posterior
+    beside = {n: replace(r, posterior=share * np.exp(r.log_posterior - first.log_posterior)) for n, r in hidden.items()}
+    return tuple(sorted((beside.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
 
 
 def which_hold_together(case: Case, evidence: Evidence) -> Reply | None:

@@ -34,6 +34,11 @@ class Torques:
         """Return those of some of the views."""
         return replace(self, values=self.values[keep], base=self.base[keep] if self.base_names else self.base)
 
+    def followed_by(self, later: "Torques") -> "Torques":
+        """Return those of these views and of later ones."""
+        base = np.concatenate([self.base, later.base]) if self.base_names else self.base
+        return replace(self, values=np.concatenate([self.values, later.values]), base=base)
+
 
 def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
     """Return gravity torques, N·m, at joint angles (V, n), rad; of 1 kg a link where masses are not known.

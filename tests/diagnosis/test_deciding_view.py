@@ -10,6 +10,7 @@ import stitch
 from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, plan_for
+from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch.diagnosis import deciding_view
 from stitch.diagnosis.deciding_view import (
@@ -25,7 +26,7 @@ from stitch.diagnosis.thresholds import ODDS
 from stitch.numerics import frames
 from stitch.session.capture import build_capture
 
-VIEWS, FURTHER = 12, 3
+VIEWS, FURTHER, PIXELS = 12, 3, 110
 
 
 def prediction(mean, sigma):
@@ -152,3 +153,17 @@ def test_rivals_that_a_verdict_holds_undecided_are_not_decided_by_the_evidence_s
     believed = deciding_views(found.linear, ahead, most=1)
     assert held.probability == pytest.approx(alike.probability)
     assert believed is None or believed.probability[0] > 0.99
+
+
+@pytest.mark.slow
+def test_a_base_that_gives_way_is_a_rival_of_joints_that_do_and_a_further_view_is_predicted_for_both():
+    """Beside joints that may give way by any size a base explains nothing: it is asked where those are not there."""
+    scene = load_scene("blade")
+    scene = replace(scene, scanner=replace(scene.scanner, columns=PIXELS, rows=PIXELS))
+    plan, rail = plan_for(scene, 0, 36)
+    plan = replace(plan, **{key: getattr(plan, key)[:7] for key in ("joints", "torque", "velocity")})
+    measured = simulate(scene, {"base_compliance": 8.0}, 0, planned=(plan, rail[:7]), waits=np.zeros(7))
+    found = stitch.diagnose(stitch.run(session_of(measured)))
+    assert (found.verdict, set(found.effects)) == ("cannot_tell", {"joint_compliance", "base_compliance"})
+    assert sum(c.ranked.posterior for c in found.candidates) <= 1
+    assert any(proposal.probability for proposal in found.next)
