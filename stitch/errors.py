@@ -58,6 +58,14 @@ class InputError(StitchError):
     exit_code = 2
 
 
+class ScaleError(InputError):
+    """Lengths that only make sense in another unit; `views` of them alone, or none: all."""
+
+    def __init__(self, message: str, views: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.views = views
+
+
 class BusyError(InputError):
     """Another process writes there: the same may do in a while."""
 

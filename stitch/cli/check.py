@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stitch.cli.options import Json
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_block
-from stitch.errors import InputError
+from stitch.errors import InputError, ScaleError
+
+if TYPE_CHECKING:
+    from stitch.screening.problems import SessionProblem
 
 
 def check(
@@ -62,24 +66,40 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
 def _check_deeply(sessions: list[Path], as_json: bool) -> None:
     """Try every usual mistake on each session; exit code 2 where something is wrong for certain."""
     from stitch.output.json_file import to_json
-    from stitch.screening.deep_check import deep_check
-    from stitch.session.reading.session_folder import load_session
 
     with show_activity("trying the usual mistakes"):
-        loaded = [(str(path), load_session(path)) for path in sessions]
-        checked = [(path, session.names, deep_check(session)) for path, session in loaded]
+        checked = [(str(path), *_problems_of(path)) for path in sessions]
     if as_json:
         documents = [
-            {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
-            for path, _, problems in checked
+            {"session": path, "ok": not problems and not unread, "problems": [p.as_dict() for p in problems]}
+            | ({"errors": [unread]} if unread else {})
+            for path, _, problems, unread in checked
         ]
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        for path, names, problems in checked:
-            for line in [p.line(names) for p in problems] or ["nothing wrong was found"]:
+        for path, names, problems, unread in checked:
+            for line in [p.line(names) for p in problems] or ["nothing wrong was found"] * (not unread):
                 say(f"{path}: {line}", hang=2)
-    if any(p.certain for _, _, problems in checked for p in problems):
+    for *_, unread in checked:
+        if unread:
+            say(f"stitch: {unread}", stream=sys.stderr)
+    if any(unread or any(p.certain for p in problems) for _, _, problems, unread in checked):
         raise typer.Exit(2)
+
+
+def _problems_of(path: Path) -> tuple[Sequence[str], list[SessionProblem], str]:
+    """Return the names of a session's views, what is wrong with them, and why it cannot be read, or ""."""
+    from stitch.screening.deep_check import deep_check
+    from stitch.screening.problems import SessionProblem
+    from stitch.session.reading.session_folder import load_session
+
+    try:
+        session = load_session(path)
+    except ScaleError as error:
+        return error.views, [SessionProblem("unit", error.views, error.command_line)], ""
+    except InputError as error:
+        return (), [], error.command_line
+    return session.names, deep_check(session), ""
 
 
 def _summary_rows(fact: dict[str, Any]) -> list[tuple[str, str]]:

@@ -64,9 +64,10 @@ def next_view_row(document: dict[str, Any]) -> dict[str, Any]:
     poses = [row for row in document["next"] if row["joints_deg"] is not None]
     deciding = (document.get("screen") or {}).get("deciding_view") or {}
     keys = ("joints_deg", "T_base_flange", "wait_s", "probability")
+    first = next(iter(poses or document["next"]), None)
     return {
         "poses": [{key: row[key] for key in keys} for row in poses],
-        "splits": list(poses[0]["separates"]) if poses else [],
+        "splits": [] if first is None else list(first["separates"]),
         "expected": deciding.get("expected", []),
         "probability_to_decide": poses[-1]["probability"] if poses else None,
     }

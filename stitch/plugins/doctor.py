@@ -43,11 +43,11 @@ def doctor(
       stitch doctor runs/blade-17 -o bundle.zip
       stitch doctor --requirements small
     """
-    if requirements is not None:
-        emit("\n".join(small_requirements()))
-        return
     from stitch.output.json_file import to_json
 
+    if requirements is not None:
+        emit(to_json({"requirements": small_requirements()}) if as_json else "\n".join(small_requirements()))
+        return
     packages = package_rows()
     document: dict[str, Any] = {"packages": packages}
     open3d = _open3d_lacks()

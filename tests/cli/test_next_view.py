@@ -22,7 +22,8 @@ def test_the_json_has_poses_rivals_expectations_and_the_odds_of_all_poses():
 
 def test_without_a_pose_there_are_no_odds_and_no_program(tmp_path):
     told = next_view_row({"next": [ARTEFACT], "screen": None})
-    assert told == {"poses": [], "splits": [], "expected": [], "probability_to_decide": None}
+    assert told == {"poses": [], "splits": ["a", "b"], "expected": [], "probability_to_decide": None}
+    assert next_view_row({"next": [], "screen": None})["splits"] == []
 
     class Diagnosis:
         next = ()

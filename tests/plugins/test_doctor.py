@@ -81,3 +81,8 @@ def test_a_bundle_holds_the_numbers_of_a_run_and_no_clouds(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["doctor", str(run), "-o", str(tmp_path / "bundle.zip")])
     assert ended.value.code == 2
+
+
+def test_what_a_small_install_needs_is_json_where_that_is_asked_for(capsys):
+    lines = said(capsys, "--requirements", "small").split()
+    assert json.loads(said(capsys, "--requirements", "small", "--json")) == {"requirements": lines}

@@ -110,17 +110,19 @@ def export_run(
     elif to in ARM_FORMATS:
         text = ARM_FORMATS[to](arm_of_run(run, effects_file, trust))
         _prove(run, on, effects_file, trust)
-        _export_text(text, to, output)
+        _export_text(text, to, output, as_json)
     elif to in HAND_EYE_FORMATS:
         with show_activity("export: reading the run"):
             eye = hand_eye_of_run(run, parent, child, with_effects)
         # ROS 1 knows launch files in XML only.
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
-        _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
+        _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output, as_json)
         if eye.of_effects:
             say(eye.of_effects, stream=sys.stderr)
     else:
         _export_cloud(run, str(to), output)
+        if as_json:
+            _emit_files(str(to), output)
 
 
 def _prove(run: Path, on: list[Path] | None, effects_file: Path | None, trust: bool) -> None:
@@ -146,15 +148,24 @@ def _prove(run: Path, on: list[Path] | None, effects_file: Path | None, trust: b
         say(proof.sentence, stream=sys.stderr)
 
 
-def _export_text(text: str, to: str, output: Path | None) -> None:
+def _export_text(text: str, to: str, output: Path | None, as_json: bool) -> None:
     from stitch.system.files import whole_file
 
-    if output is None:
+    if output is not None:
+        with whole_file(output) as file:
+            file.write_text(text, encoding="utf-8")
+        say(f"{to} to {output}")
+    if as_json:
+        _emit_files(to, output, text)
+    elif output is None:
         results_stream().write(text)
-        return
-    with whole_file(output) as file:
-        file.write_text(text, encoding="utf-8")
-    say(f"{to} to {output}")
+
+
+def _emit_files(to: str, output: Path | None, text: str | None = None) -> None:
+    """Print what was written as JSON: the format, the text of a format of text, and the file."""
+    from stitch.output.json_file import to_json
+
+    emit(to_json({"to": to, "text": text, "files": [] if output is None else [str(output)]}))
 
 
 def _export_cloud(run: Path, to: str, output: Path | None) -> None:

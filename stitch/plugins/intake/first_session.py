@@ -102,6 +102,15 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
     """
     found = find_folder_files(folder, stated.poses, stated.accepts)
+    try:
+        return _told_session(folder, found, stated)
+    except Refusal as refused:
+        refused.found = {"inventory": [listed.as_dict() for listed in found.inventory], **refused.found}
+        raise
+
+
+def _told_session(folder: Path, found: FolderFiles, stated: StatedFolder) -> FirstSession:
+    """Return the session of the list of poses that the scans tell, where several may be it."""
     if found.alike == 1:
         first = _session_of(found, stated)
         if first.choice.determined or len(found.rivals) < 2:

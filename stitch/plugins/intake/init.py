@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -153,7 +153,7 @@ def _init_from_files(folder: Path, out: Path, options: dict[str, str], yes: bool
             break
         except Refusal as refused:
             if as_json:
-                emit(json.dumps({"refused": refused.what, "fixes": [fix.as_dict(folder) for fix in refused.fixes]}))
+                emit(json.dumps(refused.as_dict(folder), indent=1))
             if not asks or not left or not any(fix.options for fix in refused.fixes):
                 raise
             options = options | _ask_way_on(refused)
@@ -203,18 +203,9 @@ def _print_guesses(guesses: Sequence[Guess]) -> None:
 
 def _report_session(out: Path, made: Made, as_json: bool) -> None:
     """Print the files, what may be wrong in them, and the next command."""
-    untold = [guess for guess in made.guesses if not guess.determined]
+    untold = made.untold
     if as_json:
-        document: dict[str, Any] = {
-            "session": str(out),
-            "views": made.views,
-            "told": not untold,
-            "guesses": [guess.as_dict() for guess in made.guesses],
-            "inventory": list(made.inventory),
-            "not_used": list(made.not_used),
-            "question": untold[0].question() if untold else None,
-        }
-        emit(json.dumps(document, indent=1))
+        emit(json.dumps({"session": str(out), "views": made.views, "told": not untold} | made.as_dict(), indent=1))
     for words in made.not_used[:_SHOWN]:
         say(f"not used: {words}", hang=2)
     if len(made.not_used) > _SHOWN:

@@ -142,7 +142,8 @@ def choose_list(folder: Path, inventory: Sequence[FoundList], clouds: Sequence[P
     if not open_:
         words = "name the file of the poses with --poses FILE, or a list of it with --poses FILE#LIST, and its columns "
         named = Fix(f"{words}with --columns x,y,z,rx,ry,rz", {"poses": "FILE#LIST", "columns": "COLUMNS"})
-        raise Refusal(f"{folder}: no list of poses there{_shown(inventory)}", named)
+        listed = {"inventory": [found.as_dict() for found in inventory]}
+        raise Refusal(f"{folder}: no list of poses there{_shown(inventory)}", named, found=listed)
     ranked: dict[bytes, tuple[Any, FoundList]] = {}
     for rank, found in sorted(((_rank(found, clouds), found) for found in open_), key=lambda one: one[0]):
         assert found.raw is not None

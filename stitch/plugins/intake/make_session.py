@@ -33,6 +33,20 @@ class Made:
     inventory: tuple[dict[str, Any], ...] = ()
     not_used: tuple[str, ...] = ()
 
+    @property
+    def untold(self) -> list[Guess]:
+        """The guesses that neither files nor measurements tell."""
+        return [guess for guess in self.guesses if not guess.determined]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As `stitch init --json` prints it."""
+        return {
+            "guesses": [guess.as_dict() for guess in self.guesses],
+            "inventory": list(self.inventory),
+            "not_used": list(self.not_used),
+            "question": self.untold[0].question() if self.untold else None,
+        }
+
 
 @dataclass(frozen=True)
 class Company:
@@ -60,10 +74,11 @@ def make_session(
         measured = measured_session(folder, stated)
     if measured is not None:
         company.tell(measured.guesses)
+        made = Made(len(measured.way.pairing.used), measured.guesses, "run")
         if not guess:
-            _require_determined(out, measured.guesses)
+            _require_determined(out, made)
         write_measured(out, measured, force=force)
-        return Made(len(measured.way.pairing.used), measured.guesses, "run")
+        return made
     if not force:
         require_free(out, draft_files(not stated.targets.is_empty))
     with one_scan_a_file(folder) as scans, _named_as(scans, folder):
@@ -72,12 +87,13 @@ def make_session(
             _require_fit(scans, first, company)
         while not guess and company.ask is not None and (answers := company.ask(first)):
             first = _judge(scans, StatedFolder.of({**options, **answers}), company)
+        inventory = tuple(found.as_dict() for found in first.files.inventory)
+        command = "run" if first.sphere_mm is None else "calibrate sphere"
+        made = Made(len(first.pairing.used), first.guesses, command, inventory, first.not_used)
         if not guess and company.ask is None:
-            _require_determined(out, first.guesses)
+            _require_determined(out, made)
         write_draft(out, first, force=force, unpacked=scans != folder)
-    inventory = tuple(found.as_dict() for found in first.files.inventory)
-    command = "run" if first.sphere_mm is None else "calibrate sphere"
-    return Made(len(first.pairing.used), first.guesses, command, inventory, first.not_used)
+    return made
 
 
 def _judge(folder: Path, stated: StatedFolder, company: Company) -> FirstSession:
@@ -131,11 +147,11 @@ def _require_fit(folder: Path, first: FirstSession, company: Company) -> None:
         raise Refusal(told, *([change(folder, advice)] if advice else []), known)
 
 
-def _require_determined(out: Path, guesses: Sequence[Guess]) -> None:
+def _require_determined(out: Path, made: Made) -> None:
     """Refuse guesses that neither files nor measurements tell."""
-    untold = [guess for guess in guesses if not guess.determined]
-    if untold:
+    if untold := made.untold:
         flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
         told = f"{out}: {', '.join(guess.what for guess in untold)} cannot be told from these views"
         states = {name: value for guess in untold for name, value in guess.states.items()}
-        raise Refusal(told, Fix(f"state {flags}", states), Fix("guess with --yes", {"yes": "yes"}))
+        ways = Fix(f"state {flags}", states), Fix("guess with --yes", {"yes": "yes"})
+        raise Refusal(told, *ways, found=made.as_dict())

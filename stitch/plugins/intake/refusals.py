@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from stitch.errors import InputError
 
@@ -39,12 +40,17 @@ class Fix:
 
 
 class Refusal(InputError):
-    """Bad input of a folder, with what leads on as data."""
+    """Bad input of a folder, with what leads on as data.
 
-    def __init__(self, what: str, *fixes: Fix) -> None:
+    Args:
+        found: guesses, inventory … of `stitch init --json`, as far as they are known by then.
+    """
+
+    def __init__(self, what: str, *fixes: Fix, found: Mapping[str, Any] | None = None) -> None:
         typed, passed = ", or ".join(fix.words for fix in fixes), ", or ".join(map(_passed, fixes))
         super().__init__(what, fix_cli=typed, fix_python=passed)
         self.fixes = fixes
+        self.found: Mapping[str, Any] = found or {}
         # "--rotation xyz: to fix: …"
         if what.endswith(":"):
             self.what, self.fix_cli, self.fix_python = f"{what} to fix: {self.fix_cli}", "", ""
@@ -56,7 +62,15 @@ class Refusal(InputError):
             return text.replace(str(scratch), str(folder))
 
         fixes = [replace(f, words=told(f.words), file=f.file and Path(told(str(f.file)))) for f in self.fixes]
-        return Refusal(told(self.what), *fixes)
+        return Refusal(told(self.what), *fixes, found=self.found)
+
+    def as_dict(self, folder: Path) -> dict[str, Any]:
+        """As `stitch init --json` prints it: what a session that is written has, and what is asked in its place."""
+        options = [dict(fix.options) for fix in self.fixes if fix.options]
+        question = {"what": self.what, "options": options} if options else None
+        fixes = [fix.as_dict(folder) for fix in self.fixes]
+        nothing: dict[str, Any] = {"guesses": [], "inventory": [], "not_used": [], "question": question}
+        return {**nothing, **self.found, "refused": self.what, "fixes": fixes}
 
 
 def _passed(fix: Fix) -> str:

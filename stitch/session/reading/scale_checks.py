@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, ScaleError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.session.session import SessionData
@@ -91,10 +91,11 @@ def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, do
     size = _length_text(float(np.median([*odd.values()])))
     usual = _length_text(float(np.median(others)))
     one = len(odd) == 1
-    raise InputError(
+    raise ScaleError(
         f"{toml}: the points of view{'' if one else 's'} {names} {does.format(size)}, those of the others (usually) "
         f'{usual}, with cloud_unit = "{cloud_unit}": {"that cloud alone is" if one else "those clouds are"} in another '
-        f"unit than the others; to fix: export {'it' if one else 'them'} again in {cloud_unit}"
+        f"unit than the others; to fix: export {'it' if one else 'them'} again in {cloud_unit}",
+        tuple(odd),
     )
 
 
@@ -102,7 +103,7 @@ def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key:
     """Refuse a size, m, beyond its limits; `does` has {} in the place of the size."""
     if not _is_plausible(size_m, limits):
         hint = f'the scale looks off by 1000: set {key} = "{_OTHER_UNIT[unit]}"'
-        raise InputError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
+        raise ScaleError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
 
 
 def _is_plausible(size_m: float, limits: Limits) -> bool:
@@ -125,7 +126,7 @@ def _compare_motions(session: SessionData, flange: Array) -> None:
     arm = _extent(flange)
     # A target that one view sees has not moved at all.
     if min(moved, arm) > 0 and not 1 / _MOTION_RATIO < moved / arm < _MOTION_RATIO:
-        raise InputError(
+        raise ScaleError(
             f"{session.path / 'session.toml'}: the targets move over {moved * 1e3:.3g} mm, the flange over "
             f"{arm * 1e3:.3g} mm; the scale looks off by 1000: write poses and targets in length_unit "
             f'(is "{session.length_unit}")'
@@ -142,7 +143,7 @@ def _compare_standoff(session: SessionData, cloud_unit: str) -> None:
     distance = float(np.median([_median_distance(points) for points in clouds]))
     low, high = _FIELD_SIZE
     if size < low * standoff or max(size, distance) > high * standoff:
-        raise InputError(
+        raise ScaleError(
             f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away over "
             f"{size:.3g}, but scanner.standoff is {standoff:.3g}; "
             f'the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'

@@ -226,3 +226,16 @@ def test_no_run_is_one_line(tmp_path):
 def same(x, y, z, rotation, T=ANYWHERE):
     assert [float(a) for a in (x, y, z)] == pytest.approx(T[:3, 3] / 1000, abs=1e-12)
     assert rotation.as_matrix() == pytest.approx(T[:3, :3], abs=1e-9)
+
+
+def test_json_alone_stands_on_standard_output(tmp_path, stitch_command):
+    run, file = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE), tmp_path / "scanner.txt"
+    text = HAND_EYE_FORMATS["kuka"](hand_eye_of_run(run))
+    assert json.loads(stitch_command("export", run, "--to", "kuka", "--json")) == {
+        "to": "kuka",
+        "text": text,
+        "files": [],
+    }
+    told = json.loads(stitch_command("export", run, "--to", "kuka", "-o", file, "--json"))
+    assert told == {"to": "kuka", "text": text, "files": [str(file)]}
+    assert file.read_text(encoding="utf-8") == text

@@ -158,3 +158,15 @@ def test_what_cannot_be_a_session_is_refused_in_one_line(raw, capsys, spoil, arg
     code, out, err = ended(capsys, "init", raw, "--yes", *arguments)
     assert code == 2 and told in err and not out
     assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
+
+
+@pytest.mark.parametrize("arguments", [(), ("--rows", "1-2")])
+def test_a_question_is_asked_in_the_json_with_what_is_known_by_then(raw, capsys, arguments):
+    """Without --yes nobody guesses: what cannot be told is the question, and nothing is written."""
+    code, out, err = ended(capsys, "init", raw, "--json", *arguments)
+    told = json.loads(out)
+    assert code == 2 and "stitch:" in err and not (raw / "session.toml").exists()
+    assert {"guesses", "inventory", "not_used", "question"} <= set(told)
+    assert set(told["question"]) >= {"what", "options"}
+    assert [set(row) for row in told["inventory"]] == [{"file", "list", "rows", "columns", "taken_for", "why_not"}]
+    assert bool(told["guesses"]) is not arguments
