@@ -395,13 +395,15 @@ def sweep_summary(rows: list[Row]) -> list[str]:
         wrong = [c and not (r["size"] and r["named"][0] in _ORDINARY) for c, r in zip(certain, group, strict=True)]
         names = Counter(" or ".join(r["named"]) for r in group if r["certain"])
         told = ", ".join(f"{name} {count}" for name, count in names.items())
-        lines.append((NOTHING, swept, share(wrong), "", told or "–"))
+        lines.append((NOTHING, swept, share(wrong), "", "", told or "–"))
     for name, group in grouped([r for r in rows if r["hidden"] != NOTHING], "hidden").items():
         right = [r["named"] == [name] for r in group]
+        alone = share(r["named"] == [name] and r["verdict"] == "missing_effect" for r in group)
         wrong = [r["verdict"] == "missing_effect" and r["named"] != [name] for r in group]
         others = Counter(" or ".join(r["named"]) or r["verdict"] for r in group if r["named"] != [name])
-        lines.append((name, "all joints", share(wrong), share(right), ", ".join(others) or "–"))
-    return markdown("hidden | sweep | certain and wrong, or a wrong single name | right name | other answers", lines)
+        lines.append((name, "all joints", share(wrong), share(right), alone, ", ".join(others) or "–"))
+    head = "hidden | sweep | certain and wrong, or a wrong single name | right name | without a rival | other answers"
+    return markdown(head, lines)
 
 
 SWEEPS = Table(sweep_jobs, sweep_trial, sweep_summary, range(100, 120), "points", "sweeps")
