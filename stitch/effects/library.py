@@ -33,7 +33,8 @@ _SHIFT = number("mm", typical=0.05, limit=2.0)
 _TILT = vector("rad", typical=2e-4, limit=0.01)
 _UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", "yz"))
 # Belief beside an effect that any arm, mount or part has: a judgement, which decides only where views hardly do. A base
-# that tilts and joints that follow a temperature are met less often than gears and springs; lost counts seldom. What is
+# that tilts and joints that follow a temperature are met less often than gears and springs; lost counts, and a link
+# that grows without the others, seldom. What is
 # like a usual effect in most sessions is that one, at less than 1 to 20: creep over an hour is like a scanner that
 # warms up, which every scanner does, and an oblique bracket like one that stands straight.
 _RARE, _SELDOM, _ALIKE = 0.3, 0.1, 0.04
@@ -113,7 +114,7 @@ def joint_step(joints: Array, views: Views, d: Array, v: float) -> Array:
     return joints + np.outer(views.number >= v, d)
 
 
-@effect("links", needs=("joints", "temperature"), prior=_RARE, g=per_joint("1/°C", 2e-5, 2e-4), T=temperature())
+@effect("links", needs=("joints", "temperature"), prior=_SELDOM, g=per_joint("1/°C", 2e-5, 2e-4), T=temperature())
 def link_thermal(links: Links, views: Views, g: Array, T: float) -> Links:
     """DH lengths of row i ×(1+g_i·(T−T₀)), T one of the temperatures that were measured"""
     return replace(links, lengths=links.lengths * (1 + np.outer(views.since_first(TEMPERATURES[round(T)]), g)))
