@@ -4,7 +4,7 @@ FEATURES: does U of features hold, on sphere plates in cells of known truth? A c
 that is in the model; an arm that is a little wrong in every joint and link; a scanner with smooth errors over field and
 incidence, each half as large as its noise; one whose smooth errors are new in each scan. All have the small errors that
 every simulated cell has. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000 to 30003,
-40000 to 40203, 42000 to 42064, 43000 to 43119.
+40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019.
 
 CHANCES: do the chances that `stitch plan` states hold? A cell with one hidden effect of the size that nature draws,
 times 0.2 to 2. Before any scan the plan says how likely an effect of that size and shape is detected, named, misnamed;
@@ -196,7 +196,7 @@ def covered_interval(seeds: Array, covered: Array) -> Array:
     return 100 * np.array([low, high])
 
 
-FEATURES = Table(feature_jobs, feature_trial, feature_summary, range(43_000, 43_120), page="measure", block="coverage")
+FEATURES = Table(feature_jobs, feature_trial, feature_summary, range(47_000, 47_200), page="measure", block="coverage")
 
 
 def trials_jobs(seeds: range, trials: int) -> Iterator[Row]:

@@ -3,7 +3,7 @@
 Blades in cells of known truth: many views; views that stand in clusters; thousands of poses with labelled points; rows
 of two sessions in one, whose parts stood at different places; poses that are read ever later, as by a clock that runs
 fast. What is said of each, how far its hand-eye is off, and by how much of its U. Kills: a moment after each time that
-a command opens, makes, renames or removes something in its folder. Used up: 9100 to 9105.
+a command opens, makes, renames or removes something in its folder. Used up: 9100 to 9106.
 """
 
 import resource

@@ -15,9 +15,12 @@ from typer.testing import CliRunner
 from data_synth.cells.verified_cell import write_verified_cell
 from stitch.cli.main import build
 from stitch.errors import InputError
+from stitch.plugins.metrology.budget import MeasuredFeatures, Number
 from stitch.plugins.metrology.feature_file import read_features
+from stitch.plugins.metrology.features import Feature
 from stitch.plugins.metrology.planning.command import place_of
-from stitch.plugins.metrology.verification import largest_E_n
+from stitch.plugins.metrology.verification import largest_E_n, verify
+from stitch.run_data import HandEyeTransfer
 from tests.in_browser import WAYS, require_for_everybody
 from viz.features_page import write_certificate, write_features
 
@@ -111,6 +114,22 @@ def test_verify_fails_one_number_that_is_off_however_many_agree(cell):
     code, one = _verify(cell, features)
     assert one["agreeing"] == 14 and [number["passes"] for number in one["numbers"]].count(False) == 1
     assert code == 3 and one["passed"] is False and "ball 1 is off by" in one["sentence"]
+
+
+@pytest.mark.parametrize(("together", "holds"), [(True, True), (False, False)])
+def test_numbers_that_one_thing_displaces_count_as_one(together, holds):
+    features = [Feature(f"point {k}", "point", calibrated=0.0) for k in range(20)]
+    moved = np.where(np.arange(20) < 7, 1.1, 0.3)
+    numbers = [
+        Number(feature, "deviation", "mm", by, 0.0, 0.5, np.inf, {}, 100, 0.01)
+        for feature, by in zip(features, moved.tolist(), strict=True)
+    ]
+    covariance = 0.25 * np.eye(20)
+    if together:
+        covariance[:7, :7] = 0.2475 + 0.0025 * np.eye(7)
+    agrees = HandEyeTransfer(0.0, 0.0, 0.5, 0.1, 0.1, 0.9)
+    result = verify(MeasuredFeatures(tuple(numbers), covariance, (), "mm"), None, agrees)
+    assert result.agreeing == 13 and result.U_holds is holds
 
 
 def test_verify_fails_a_hand_eye_that_its_numbers_do_not_show(cell):
