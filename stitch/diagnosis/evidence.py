@@ -390,7 +390,8 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     These views cannot tell it from those. One that predicts them clearly better and stands every other test takes the
     place of the name: a Bayes factor charges for plausible sizes that may be wrong, as a user's are, and what was not
     seen does not. What a second effect leaves on views left out may hide by how much the first predicts them better.
-    What begins at some view may begin at nearly the first, where it is what lasts: of such the odds decide.
+    What begins at some view may begin at nearly the first, where it is what lasts, and views left out beside a jump say
+    little of it: of such the odds decide.
     """
     if evidence.verdict != "missing_effect" or evidence.second is not None:
         return None
@@ -400,7 +401,7 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
         r.name: r
         for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
         if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
-        if r.log_posterior > least or not any(p.discrete for p in r.score.candidate.parameters)
+        if r.log_posterior > least or not any(p.discrete for e in (r, named) for p in e.score.candidate.parameters)
     }
     of_rivals = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
     left_out = dict(evidence.left_out) | of_rivals
