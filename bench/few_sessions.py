@@ -58,7 +58,7 @@ def trial(job: Row) -> Row:
         reported = np.array(true)
         reported[v] = reported[v] @ frames.make(np.eye(3), by * direction)
         row, state = _said(replace(measured, T_base_flange=reported), v)
-        if not by and state is not None:
+        if not by and state is not None and not state.left_out:
             row["chi2"] = hand_eye_chi_square(measured, state) / 6
             knowing = _KnowingTest(measured, state, plan, rail, job["arm"], rng)
         if knowing is not None:

@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from bench.harness import Row, Table, grouped, markdown, share, stitch_process, with_all
 from data_synth.fixtures import quiet_scenes
@@ -24,14 +23,11 @@ from data_synth.scene import Scene
 from data_synth.shapes.casting import with_stock
 from data_synth.simulate import Measured
 from data_synth.write import write_session
-from stitch.fusion.register import METHODS, normal_equations, prior_precision, register
+from stitch.fusion.register import METHODS, register
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.observations.surfaces.hand_eye_fit import capture_repeatability, hand_eye_jacobian
-from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.output.stored_run import load_run
 from stitch.run_data import RunData
-from stitch.screening.stock import with_free_hand_eye
 
 SIZES, PARTS = (0.1, 0.2, 0.3, 0.5), {"all": 1.0, "half": 0.5, "a third": 1 / 3}
 MOUNTS, VIEWS, PIXELS = ("eye_to_hand", "eye_in_hand"), 12, 90
@@ -102,44 +98,32 @@ def trial(job: Row) -> Row:
             "left_out": [item["view"] for item in result.get("left_out", [])],
         }
         if job["kind"] == "stock":
-            row |= _poses(load_run(out), measured, view) if name not in row["left_out"] else {}
+            sigma = next((stock["pose_sigma"] for stock in said if stock["view"] == name), None)
+            row |= _poses(load_run(out), measured, view, sigma) if name not in row["left_out"] else {}
     return row
 
 
-def _poses(run: RunData, measured: Measured, view: int) -> Row:
-    """Return the view's pose error in sigmas, and in µm by each method: as it runs, and from scans as they came."""
+def _poses(run: RunData, measured: Measured, view: int, sigma: list[float] | None) -> Row:
+    """Return the view's pose error in sigmas as stated, and in µm by each method: from scans as they came, and without
+    stock."""
     kept = [int(name[1:]) for name in run.session.names]
     own = kept.index(view)
     true = measured.T_reference_scanner[kept]
     capture = run.measurement.capture
     raw = captured(measured).without(np.setdiff1d(np.arange(VIEWS), kept))
-    free = unconstrained_poses(capture, run.poses_model, run.gate)
-    scatter = capture_repeatability(capture, free, run.T_mount)
-    error = _error(run.registered.gram.centre, run.poses, true, own)
-    equations = normal_equations(
-        run.registered, capture, run.poses, run.poses_model, scatter=scatter, method=METHODS["dpwvm"]
-    )
-    centre = run.registered.gram.centre
-    prior = prior_precision(capture, scatter, centre)
-    jacobian = hand_eye_jacobian(capture.hand_eye_frames(run.T_mount), centre)
-    H = equations.H + with_free_hand_eye(prior, jacobian) - block_diag(*prior)
-    # Against the mean of the others, since no scan shows where all of them stand.
-    against = np.full(len(kept), -1 / (len(kept) - 1))
-    against[own] = 1.0
-    difference = np.kron(against, np.eye(6))
-    covariance = difference @ np.linalg.pinv(H, hermitian=True) @ difference.T
-    row: Row = {"pose_sigmas": (error / np.sqrt(np.diag(covariance))).tolist()}
+    middle = frames.transform(run.poses[own], capture.scans[own].points.mean(axis=0)[None])[0]
+    row: Row = {} if sigma is None else {"pose_sigmas": (_error(middle, run.poses, true, own) / sigma).tolist()}
     for name, method in METHODS.items():
         for scans, of_scans in zip(_SCANS, (raw, capture), strict=True):
-            poses = register(of_scans, run.poses_model, scatter, run.gate, method=method).poses
-            row[f"{name}, {scans}"] = 1e3 * float(np.linalg.norm(_error(centre, poses, true, own)[3:]))
+            poses = register(of_scans, run.poses_model, run.repeatability, run.gate, method=method).poses
+            row[f"{name}, {scans}"] = 1e3 * float(np.linalg.norm(_error(middle, poses, true, own)[3:]))
     return row
 
 
-def _error(centre: Array, poses: Array, true: Array, own: int) -> Array:
-    """Return (6,) twist about `centre` by which one pose is off, beside the mean of the others."""
-    to_centre = frames.make(np.eye(3), -centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ true))
+def _error(middle: Array, poses: Array, true: Array, own: int) -> Array:
+    """Return (6,) twist about a point (3,) by which one pose is off, beside the mean of the others."""
+    to_middle = frames.make(np.eye(3), -middle)
+    twists = frames.log(to_middle @ poses @ frames.inverse(to_middle @ true))
     return twists[own] - np.delete(twists, own, axis=0).mean(axis=0)
 
 
@@ -163,7 +147,7 @@ def summary(rows: list[Row]) -> list[str]:
         for size, group in with_all(grouped(displaced, "size")).items()
     ]
     out += ["", *markdown("displaced by / mm | called stock | left out", called), ""]
-    posed = [row for row in stock if "pose_sigmas" in row]
+    posed = [row for row in stock if "dpwvm, taken off" in row]
     by_method = [
         [name, *(f"{np.sqrt(np.mean([row[f'{name}, {scans}'] ** 2 for row in posed])):.1f}" for scans in _SCANS)]
         for name in METHODS

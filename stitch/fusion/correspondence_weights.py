@@ -156,18 +156,18 @@ class OffsetSums:
         for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
             weight, first = float(w.sum()), float(w @ m.residual)
             rows = frames.plane_rows(m.middle - g.centre, m.normal)
-            acts = {m.v: _acts(capture, m.v, m.index_v), m.w: -_acts(capture, m.w, m.index_w)}
-            for b, of_b in acts.items():
+            sides = {m.v: acts(capture, m.v, m.index_v), m.w: -acts(capture, m.w, m.index_w)}
+            for b, of_b in sides.items():
                 pull = (w * of_b) @ rows
                 self.vector[b] += (w * of_b) @ m.residual
                 self.coupling[m.v, :, b] += pull
                 self.coupling[m.w, :, b] -= pull
-                for a, of_a in acts.items():
+                for a, of_a in sides.items():
                     self.matrix[a, b] += w @ (of_a * of_b)
             self.square[i] = float(w @ m.residual**2) - first**2 / max(weight, 1e-300)
 
 
-def _acts(capture: Capture, view: int, index: Indices) -> Array:
+def acts(capture: Capture, view: int, index: Indices) -> Array:
     """Return (M,) 1 for points of a view on which its offset acts, 0 for others."""
     stock = capture.scans[view].stock
     return np.ones(len(index)) if stock is None else stock.points[index].astype(float)

@@ -15,10 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.sparse import csr_array
 
 from stitch.errors import InputError, did_you_mean
 from stitch.fusion.correspondence_weights import (
     OffsetSums,
+    acts,
     class_variances,
     dpwvm_weights,
     plane_weights,
@@ -27,7 +30,8 @@ from stitch.fusion.correspondence_weights import (
 )
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.numerics.least_squares import symmetric_inverse
+from stitch.observations.surfaces.hand_eye_fit import Repeatability, hand_eye_jacobian
 from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import (
     FINE_SAMPLES,
@@ -152,7 +156,7 @@ def _without_mean_motion(start: Array, model_poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Of data and prior, for twists of all views about the centre; the inverse of H is their covariance."""
+    """Of data and prior, for twists of all views about the centre; `pose_covariance` has what these vary by."""
 
     H: Array  # (6V, 6V)
     b: Array  # (6V,)
@@ -194,6 +198,55 @@ def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> 
     carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
     sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
     return np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)).astype(float, copy=False)
+
+
+def with_free_mean(precision: Array, columns: Array) -> Array:
+    """Return (6V, 6V) K = Λ − ΛJ(JᵀΛJ)⁻¹JᵀΛ of precisions Λ (V, 6, 6) of the views' twists, columns J (6V, k) free."""
+    L = block_diag(*precision)
+    LJ = L @ columns
+    return L - LJ @ symmetric_inverse(columns.T @ LJ) @ LJ.T
+
+
+def pose_covariance(
+    overlaps: Overlaps, capture: Capture, poses: Array, T_mount: Array, scatter: Repeatability, method: Method
+) -> Array:
+    """Return the covariance (6V, 6V) of what registered views turn and move about the centre of the overlaps.
+
+    The hand-eye is free, and no scan shows where all views stand: it holds for differences between them. A point's
+    noise is in every distance that the point has a part in, so that these are not independent: what each point pulls in
+    all of them counts, by the noise that its own scan shows (a sandwich, Liang and Zeger 1986, Biometrika 73:13).
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner as registered.
+    """
+    g, size = overlaps.gram, 6 * len(poses)
+    variance = g.variance * scatter.noise_factor
+    prior = prior_precision(capture, scatter, g.centre)
+    K = with_free_mean(prior, hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre))
+    equations = normal_equations(overlaps, capture, poses, poses, scatter=scatter, method=method)
+    inverse = symmetric_inverse(equations.H - block_diag(*prior) + K)
+    weights = method.weigh(overlaps.matches, capture, poses)
+    # Offsets that cost nothing are unknowns too: what they take from a distance follows from their own sums.
+    free = [v for v, scan in enumerate(capture.scans) if method.offsets and (scan.stock or v in equations.offsets)]
+    sums = OffsetSums(g, overlaps.matches, weights, capture)
+    taken = np.linalg.solve(sums.matrix[np.ix_(free, free)], sums.coupling.reshape(size, -1)[:, free].T)
+    pulls = [csr_array((len(scan.points), size + len(free))) for scan in capture.scans]
+    for m, weight in zip(overlaps.matches, weights, strict=True):
+        rows = frames.plane_rows(m.middle - g.centre, m.normal)
+        pulled = np.zeros((len(rows), size + len(free)))
+        sides = ((m.v, m.index_v, 1.0), (m.w, m.index_w, -1.0))
+        for v, index, sign in sides:
+            pulled[:, 6 * v : 6 * v + 6] = sign * rows
+            if v in free:
+                pulled[:, size + free.index(v)] = sign * acts(capture, v, index)
+        for v, index, sign in sides:
+            at = index, np.arange(len(index))
+            of_points = csr_array((sign * weight / variance, at), (len(capture.scans[v].points), len(index)))
+            pulls[v] = pulls[v] + of_points @ csr_array(pulled)
+    known = [scan.noise if np.isfinite(scan.noise) else np.sqrt(g.variance / 2) for scan in capture.scans]
+    meat = sum(noise**2 * (pulled.T @ pulled).toarray() for noise, pulled in zip(known, pulls, strict=True))
+    left = np.hstack([np.eye(size), -taken.T])
+    return inverse @ (left @ meat @ left.T + K) @ inverse
 
 
 class _Progress:

@@ -179,10 +179,10 @@ class BlockLeastSquares:
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
 
 
-def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
+def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Array:
     """(k, k) inverse of what is scaled (k, k) in some units (k,); what nothing shows is zero in it."""
     values, vectors = np.linalg.eigh(scaled)
-    shown = np.abs(values) > 1e-14 * np.abs(values).max(initial=0.0)
+    shown = np.abs(values) > relative * np.abs(values).max(initial=0.0)
     vectors = vectors[:, shown] * unit[:, None]
     return (vectors / values[shown]) @ vectors.T
 
@@ -232,6 +232,11 @@ def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Arra
     keep = values > relative * values[-1]
     projected = vectors[:, keep].T @ (-vector * unit) / values[keep]
     return unit * (vectors[:, keep] @ projected)
+
+
+def symmetric_inverse(matrix: Array, relative: float = 1e-10) -> Array:
+    """(k, k) inverse of a symmetric matrix of mixed units; what nothing shows is zero in it."""
+    return _pseudo_inverse(*equilibrated(matrix), relative)
 
 
 def summed_squares(blocks: Array) -> Array:

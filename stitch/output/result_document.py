@@ -14,9 +14,11 @@ from stitch.effects.axis_effects import SCANNER_PLACEMENT
 from stitch.effects.contract import Effect, Parameter
 from stitch.effects.user_source import FILE, source_of
 from stitch.errors import InputError
+from stitch.fusion.register import method_named, pose_covariance
 from stitch.model.hand_eye_alone import HandEyeAlone, hand_eye_alone
 from stitch.model.model import EffectsCovariance, Target
 from stitch.model.model_toml import ModelFile
+from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.scanner_places import ScannerAlone
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
@@ -67,6 +69,9 @@ class StockRow(NamedTuple):
     thickness: float  # length_unit, outwards
     sigma: float
     share: float  # of the scan's surface
+    # (6,) of its pose, once the stock is off, beside the mean of the other views: by which it turns, rad, and by which
+    # the middle of its points moves, length_unit, reference frame.
+    pose_sigma: Array | None = None
 
 
 def result_document(run: RunData) -> dict[str, Any]:
@@ -301,7 +306,20 @@ def _stock_rows(run: RunData) -> list[StockRow]:
     """Return the stock that was taken off the scans."""
     scans = zip(run.session.names, run.measurement.capture.scans, strict=False)
     found = [(name, scan.stock) for name, scan in scans if scan.stock is not None]
-    return [StockRow(name, stock.thickness, stock.sigma, stock.share) for name, stock in found]
+    return [StockRow(name, s.thickness, s.sigma, s.share, _pose_sigma(run, name)) for name, s in found]
+
+
+def _pose_sigma(run: RunData, name: str) -> Array:
+    """Return the sigmas (6,) of the pose of a view, beside the mean of the others."""
+    assert run.registered is not None
+    capture, count, view = run.measurement.capture, len(run.poses), run.session.names.index(name)
+    covariance = pose_covariance(
+        run.registered, capture, run.poses, run.T_mount, run.repeatability, method_named(run.register_method)
+    )
+    middle = frames.transform(run.poses[view], capture.scans[view].points.mean(axis=0)[None])[0]
+    against = np.where(np.arange(count) == view, 1.0, -1 / (count - 1))
+    moved = np.kron(against, frames.adjoint(frames.make(np.eye(3), run.registered.gram.centre - middle)))
+    return np.sqrt(np.diag(moved @ covariance @ moved.T))
 
 
 def stock_of_views(document: dict[str, Any], names: Sequence[str]) -> dict[int, Stock]:
@@ -478,7 +496,11 @@ _ALONE = Document(
     Key("spread", NUMBER),
 )
 _SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
-_STOCK = Document(Key("view", TEXT), *(Key(name, NUMBER) for name in ("thickness", "sigma", "share")))
+_STOCK = Document(
+    Key("view", TEXT),
+    *(Key(name, NUMBER) for name in ("thickness", "sigma", "share")),
+    Key("pose_sigma", array_of(6), optional=True),
+)
 _LEFT_OUT = Document(Key("view", TEXT), Key("why", TEXT))
 _WEAK = Document(
     Key("view", TEXT, write=itemgetter(0)),

@@ -24,9 +24,9 @@ _ROTATION, _TRANSLATION_M = 0.010, 0.005
 # No effect of an arm is believed to displace a single view by more than half of that.
 _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 _NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
-# Odds from which a doubt is said: good sessions on ordinary arms seldom reach half of that. The largest odds that are
+# Odds from which a doubt is said: good sessions on ordinary arms reach a half in 4 of 55. The largest odds that are
 # told, and the share of the probability from which one view is named.
-_DOUBTED_FROM, _MOST_ODDS, _LIKELY_VIEW = 0.6, 1000.0, 0.9
+_DOUBTED_FROM, _MOST_ODDS, _LIKELY_VIEW = 0.5, 1000.0, 0.9
 # Views that are named as farthest off.
 _LISTED = 3
 # Rounding explains a scatter of no more than so many times what it makes, and no less than its part.

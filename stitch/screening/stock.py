@@ -10,24 +10,30 @@ scatter that the others show, the hand-eye free too:
     displaced   e = B δ + noise, the view at any pose;
     stock       e = B δ + a·s·cos + noise, its pose as near to the robot's as poses scatter, s = 1 where it has stock.
 
+Where all poses are read late, or an arm is poor, the surface of the others is known no better than their poses scatter:
+stock that is thinner than three times that is left to the poses.
+
 Stock has a size and a place: the whole view, or the region in which the median distance about a point is nearer to a
 than to none. Points at its edge count for neither side. It is said where it explains distances that no motion does.
-Neighbouring distances share points, normals and the scanner's own errors: sums over patches of the surface say how much
-less they tell than independent ones (a sandwich, Liang and Zeger 1986, Biometrika 73:13).
+The scale of the kernel is halved from that of all that is off to that of noise (graduated non-convexity, Blake and
+Zisserman 1987), so that no explanation ends beside its own best one. Neighbouring distances share points, normals and
+the scanner's own errors: sums over patches of the surface say how much less they tell than independent ones (a
+sandwich, Liang and Zeger 1986, Biometrika 73:13).
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch.fusion.correspondence_weights import OffsetSums
-from stitch.fusion.register import prior_precision
+from stitch.fusion.register import prior_precision, with_free_mean
 from stitch.model.model import Model
 from stitch.numerics import frames
-from stitch.numerics.distributions import tukey
+from stitch.numerics.distributions import mad_sigma, tukey
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import symmetric_inverse
 from stitch.numerics.units import length_text
 from stitch.observations.pose_errors import usual_twist
 from stitch.observations.surfaces.field_error import field_error
@@ -37,6 +43,7 @@ from stitch.observations.surfaces.normal_equations import assemble
 from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.screening.hypotheses import problem
+from stitch.screening.plausibility import scatters_beyond_effects
 from stitch.screening.problems import SessionProblem
 from stitch.screening.snooping import Snooping
 from stitch.screening.view_model import view_model
@@ -46,16 +53,17 @@ from stitch.session.scan import Scan, Stock
 from stitch.session.session import SessionData
 
 # Points of a view that are asked, and the fewest distances that say anything; views that say where it belongs.
-_SAMPLES, _FEWEST, _FEWEST_VIEWS, _MOST_VIEWS = 1000, 100, 4, 60
+_SAMPLES, _FEWEST, _FEWEST_VIEWS, _MOST_VIEWS = 1000, 100, 4, 30
 # Distances about a point that say whether it has stock, and those among which a region has no edge.
 _NEIGHBOURS, _AROUND, _PURE = 25, 60, 0.02
-# Steps of each fit, the share of sigma by which the last one moves a view, and patches along a view.
-_STEPS, _CONVERGED, _PATCHES = 20, 0.02, 6
-# Stock of fewer sigmas of a single distance, or of its own uncertainty, is none; nor on less of a view's surface.
-_LEAST, _SURE, _LEAST_SHARE = 1.5, 5.0, 0.05
-# Nats by which stock explains more than any motion does, and than none (20,000 to 1); by which stock on a region is
-# likelier than on the whole view, or than a torn scan (150 to 1). Share of distances that are of no surface.
-_MARGIN, _REGION, _STRAY = 10.0, 5.0, 0.02
+# Steps of each fit, shares of the kernel's scale and of sigma by which one moves a view before the scale is halved and
+# before the fit ends, and patches along a view.
+_STEPS, _TORN_STEPS, _NEAR, _CONVERGED, _PATCHES = 40, 20, 0.5, 0.02, 6
+# Stock of fewer sigmas of a single distance, of its own uncertainty or of the poses is none; nor on less of a surface.
+_LEAST, _SURE, _TIMES_SCATTER, _LEAST_SHARE = 1.5, 5.0, 3.0, 0.05
+# Nats by which stock explains more than any motion does, and than none (20,000 to 1), and than a torn scan (150 to 1).
+# Share of distances that are of no surface.
+_MARGIN, _OVER_TORN, _STRAY = 10.0, 5.0, 0.02
 # Eleven views hardly say how poses scatter: by half of what is usual at the least.
 _LEAST_SCATTER = 0.5
 # Of two scales of scanners, in sigmas of one: four of their difference.
@@ -64,7 +72,7 @@ _SCALES_APART = 4 * np.sqrt(2)
 _MOST_OFF = 1 / 3
 # Level at which the scanner's errors, the same in all views, are unusual.
 _UNUSUAL = 0.01
-# Views that are asked: those that stand off, those whose overlaps keep a shape (in sigma of a distance, and in what
+# Views that are asked: those whose overlaps keep a shape (in sigma of a distance, and in what
 # other views keep), those that an offset of the whole view would help by so many sigmas; no more than so many.
 _SHAPE, _TIMES_USUAL, _OFFSET, _MOST_ASKED = 0.5, 2.0, 4.0, 4
 
@@ -84,10 +92,11 @@ def find_stock(
     scatter = repeatability_from(snooping.blunder_search.fit.variances)
     off = sorted({m.view for m in (*snooping.misplaced, *snooping.suspected)})
     most = _MOST_OFF * len(capture.scans)
-    if capture.none_has_stock or len(capture.scans) - len(off) <= _FEWEST_VIEWS or len(off) > most:
+    few = len(capture.scans) - len(off) <= _FEWEST_VIEWS or len(off) > most
+    if capture.none_has_stock or few or scatters_beyond_effects(session, snooping):
         return {}
     taken = [v for v, scan in enumerate(capture.scans) if scan.stock is not None]
-    for view in _asked(capture, T_mount, unconstrained, scatter, off):
+    for view in _asked(capture, T_mount, unconstrained, scatter):
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
@@ -140,15 +149,13 @@ def locate_stock(
     return located
 
 
-def _asked(
-    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability, off: Collection[int]
-) -> list[int]:
+def _asked(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability) -> list[int]:
     """Return the views that may have stock, the likeliest first."""
     shape = _shape_left(capture, unconstrained)
     offset = _whole_offsets(capture, T_mount, unconstrained, scatter)
     least = max(_SHAPE, _TIMES_USUAL * float(np.median(shape)))
     likely = {v: max(shape[v] / least, offset[v] / _OFFSET) for v in range(len(shape))}
-    asked = [v for v in likely if (likely[v] > 1 or v in off) and capture.scans[v].stock is None]
+    asked = [v for v in likely if likely[v] > 1 and capture.scans[v].stock is None]
     return sorted(asked, key=lambda v: -likely[v])[:_MOST_ASKED]
 
 
@@ -183,10 +190,10 @@ def _whole_offsets(
     variance = g.variance * max(scatter.noise_factor, 1.0)
     H, b = assemble(g, ~g.labelled)
     jacobian = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
-    K = with_free_hand_eye(prior_precision(capture, scatter, g.centre), jacobian)
+    K = with_free_mean(prior_precision(capture, scatter, g.centre), jacobian)
     H = H / variance + K
     C = sums.coupling.reshape(len(H), -1) / variance
-    solved = _solve(H, np.column_stack([C, b / variance + K @ unconstrained.twists.ravel()]))
+    solved = symmetric_inverse(H) @ np.column_stack([C, b / variance + K @ unconstrained.twists.ravel()])
     A = np.diag(sums.matrix / variance - C.T @ solved[:, :-1])
     c = sums.vector / variance - C.T @ solved[:, -1]
     return np.abs(c) / np.sqrt(np.maximum(A, 1e-9 * A.max()))
@@ -206,19 +213,13 @@ def stock_of(
     case = _hold_against_others(capture, T_mount, gate, view, off, usual)
     if case is None:
         return None
-    fits = {kind: _fit(case, kind) for kind in ("whole", "region")}
-    whole, region = fits["whole"], fits["region"]
-    if whole is None or region is None:
+    best = _fit(case, "stock")
+    if best is None or best.share < _LEAST_SHARE or best.over_torn < _OVER_TORN:
         return None
-    best = region if region.log_likelihood > whole.log_likelihood + _REGION else whole
-    clear = abs(best.thickness) > max(_LEAST * case.sigma, _SURE * best.sigma) and best.share > _LEAST_SHARE
-    if not clear:
+    if abs(best.thickness) < max(_LEAST * case.sigma, _SURE * best.sigma, _TIMES_SCATTER * case.scatter):
         return None
-    rivals = [_fit(case, "moved"), _fit(case, "still")]
-    shared = max(case.factor, best.shared)
-    others = [r.log_likelihood for r in rivals if r is not None]
-    gains = [(best.log_likelihood - r) * case.factor / shared for r in others]
-    if min(gains, default=np.inf) < _MARGIN or best.over_torn < _REGION:
+    rivals = [fit.evidence for fit in (_fit(case, "moved"), _fit(case, "still")) if fit is not None]
+    if best.evidence < max(rivals, default=-np.inf) + _MARGIN:
         return None
     return Stock(best.thickness, best.sigma, best.share, best.points)
 
@@ -229,76 +230,80 @@ class _Case:
 
     capture: Capture
     view: int
-    partners: list[int]  # the other views
     start: Array  # (V, 4, 4) T_reference_scanner
     centre: Array  # (3,) about which twists count, reference frame
     H: Array  # (6V, 6V) of the overlaps of the others, in units of their noise
     b: Array  # (6V,)
     twists: Array  # (6V,) from the robot's poses to `start`
-    precision: Array  # (V, 6, 6) of the robot's poses
-    jacobian: Array  # (6V, 6) of the hand-eye
+    held: Array  # (6V, 6V) precision of the robot's poses, their mean free
+    free: Array  # (6V, 6V) the same, the view itself at any pose
     gate: float
     sigma: float  # robust, of a distance
     factor: float  # of its variance: distances share points
+    scatter: float  # of the robot's poses, length_unit
 
-    def prior(self, is_free: bool) -> Array:
-        """(6V, 6V) precision of the poses, the hand-eye free; of the view itself none where it is free."""
-        precision = self.precision.copy()
-        if is_free:
-            precision[self.view] = 0.0
-        return with_free_hand_eye(precision, self.jacobian)
+    def distances(self, x: Array, offset: Array) -> tuple[Array, Array, Indices, Array, Array] | None:
+        """Return the view's distances (M,) from the others, their weights, its points, the cosine between a point's
+        normal and the mean one, and their change (M, 6V) by twists of all views; None for too few.
+
+        Args:
+            x: (6V,) by which the views are turned and moved.
+            offset: (N,) by which the view's points are taken back along their normals.
+        """
+        poses = frames.moved_about(self.centre, x.reshape(-1, 6), self.start)
+        scan = self.capture.scans[self.view]
+        if offset.any():
+            moved = scan.points - offset[:, None] * scan.normals
+            scan = replace(scan, points=moved, tree=KDTree(moved, leafsize=16))
+        scans = [scan if v == self.view else other for v, other in enumerate(self.capture.scans)]
+        samples = [sample_points(other, _SAMPLES) for other in scans]
+        pairs = [(self.view, w) for w in range(len(scans)) if w != self.view]
+        matches = match_pairs(scans, poses, pairs, self.gate, samples)[0]
+        if sum(len(m.residual) for m in matches) < _FEWEST:
+            return None
+        columns = zip(*(m.columns for m in matches), strict=True)
+        middle, normal, e, weight, index, _ = (np.concatenate(column) for column in columns)
+        own = frames.plane_rows(middle - self.centre, normal)
+        partner = np.repeat([m.w for m in matches], [len(m.residual) for m in matches])
+        rows = np.zeros((len(e), len(poses), 6))
+        rows[:, self.view] = own
+        rows[np.arange(len(e)), partner] -= own
+        cosine = np.einsum("ni,ni->n", frames.rotate(poses[self.view], scan.normals[index]), normal)
+        return e, weight, index, cosine, rows.reshape(len(e), -1)
 
 
 def _hold_against_others(
     capture: Capture, T_mount: Array, gate: float, view: int, off: Collection[int], usual: Array
 ) -> _Case | None:
     """Free the other views, those near it where there are many, and say what they show of the robot's poses."""
-    model_poses = capture.poses(T_mount)
-    middles = frames.transform(model_poses, np.array([[scan.points.mean(axis=0)] for scan in capture.scans]))[:, 0]
+    poses = capture.poses(T_mount)
+    middles = frames.transform(poses, np.array([[scan.points.mean(axis=0)] for scan in capture.scans]))[:, 0]
     near = np.argsort(np.linalg.norm(middles - middles[view], axis=1), kind="stable")
-    far = near[_MOST_VIEWS:]
-    gone = np.array(sorted({*off, *far.tolist()} - {view}), np.int64)
-    kept = np.setdiff1d(np.arange(len(model_poses)), gone)
-    capture, model_poses, view = capture.without(gone), model_poses[kept], int(np.searchsorted(kept, view))
-    partners = [v for v in range(len(kept)) if v != view]
-    if len(partners) < _FEWEST_VIEWS:
+    gone = np.array(sorted({*off, *near[_MOST_VIEWS:].tolist()} - {view}), np.int64)
+    kept = np.setdiff1d(np.arange(len(poses)), gone)
+    capture, poses, view = capture.without(gone), poses[kept], int(np.searchsorted(kept, view))
+    others = np.delete(np.arange(len(kept)), view)
+    if len(others) < _FEWEST_VIEWS:
         return None
     rest = capture.without(np.array([view]))
-    free = unconstrained_poses(rest, model_poses[partners], gate)
-    g = free.overlaps.gram
-    variances = view_model(rest, T_mount, free).fit().variances
+    unconstrained = unconstrained_poses(rest, poses[others], gate)
+    g = unconstrained.overlaps.gram
+    mean = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
+    at = (6 * others[:, None] + np.arange(6)).ravel()
+    variances = view_model(rest, T_mount, unconstrained).fit().variances
     rotation, translation = np.maximum(np.sqrt(variances[:2]), _LEAST_SCATTER * usual[[0, 3]]).tolist()
     factor = max(float(variances[2]), 1.0)
-    at = (6 * np.array(partners)[:, None] + np.arange(6)).ravel()
     H, b, twists = np.zeros((6 * len(kept), 6 * len(kept))), np.zeros(6 * len(kept)), np.zeros(6 * len(kept))
     H[np.ix_(at, at)], b[at] = (part / (g.variance * factor) for part in assemble(g))
-    twists[at] = free.twists.ravel()
-    start = np.array(model_poses)
-    start[partners] = free.poses
+    twists[at] = unconstrained.twists.ravel()
+    start = np.array(poses)
+    start[others] = unconstrained.poses
     precision = prior_precision(capture, Repeatability(rotation, translation, factor), g.centre)
-    jacobian = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
-    return _Case(
-        *(capture, view, partners, start, g.centre, H, b, twists, precision, jacobian),
-        *(free.overlaps.gate, g.scale, factor),
-    )
-
-
-def with_free_hand_eye(precision: Array, jacobian: Array) -> Array:
-    """Return (6V, 6V) K = Λ − ΛJ(JᵀΛJ)⁻¹JᵀΛ of precisions Λ (V, 6, 6) of the views' twists."""
-    count = len(precision)
-    blocks = np.zeros((count, 6, count, 6))
-    blocks[np.arange(count), :, np.arange(count)] = precision
-    L = blocks.reshape(6 * count, -1)
-    LJ = L @ jacobian
-    return L - LJ @ _solve(jacobian.T @ LJ, LJ.T)
-
-
-def _solve(matrix: Array, vectors: Array) -> Array:
-    """Return the solution of a symmetric system in equilibrated unknowns; what nothing holds stays where it is."""
-    diagonal = np.diag(matrix)
-    unit = np.where(diagonal > 1e-300, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
-    scaled = matrix * unit[:, None] * unit + 1e-10 * np.eye(len(matrix))
-    return (unit * np.linalg.solve(scaled, (vectors.T * unit).T).T).T
+    held = with_free_mean(precision, mean)
+    precision[view] = 0.0
+    free = with_free_mean(precision, mean)
+    gate = unconstrained.overlaps.gate
+    return _Case(capture, view, start, g.centre, H, b, twists, held, free, gate, g.scale, factor, translation)
 
 
 @dataclass(frozen=True)
@@ -309,132 +314,83 @@ class _Fit:
     sigma: float
     points: Mask  # (N,) of the view, that have stock
     share: float
-    log_likelihood: float  # of distances and poses
-    shared: float  # variance of sums of distances over that of independent ones
-    over_torn: float  # log likelihood over a motion of the region; infinite for none
-
-
-@dataclass(frozen=True)
-class _Distances:
-    """Distances of one view's points from the others' surfaces, M of them."""
-
-    matches: Sequence[Match]
-    e: Array  # (M,)
-    weight: Array  # (M,)
-    index: Indices  # (M,) of the view's points
-    cosine: Array  # (M,) between its normal and the mean one
-    rows: Array  # (M, 6) by a twist of the view
+    evidence: float  # log likelihood of distances and poses
+    over_torn: float  # of a region: by how much it is likelier than a motion of the region; infinite for none
 
 
 def _fit(case: _Case, kind: str) -> _Fit | None:
-    """Fit all poses to one explanation: `still`, `moved`, or stock on the `whole` view or on a `region` of it."""
-    K = case.prior(kind == "moved")
+    """Fit all poses to one explanation: `still`, `moved`, or `stock` on the view or on a region of it."""
+    K = case.free if kind == "moved" else case.held
     # Each view begins where robot and hand-eye expect it.
-    expected = case.prior(False)
-    x = -_solve(case.H + expected, case.b + expected @ case.twists)
+    x = -symmetric_inverse(case.H + case.held) @ (case.b + case.held @ case.twists)
     scan = case.capture.scans[case.view]
-    thickness = 0.0
+    thickness, scale = 0.0, np.inf
     points = np.zeros(len(scan.points), bool)
-    for step in range(_STEPS):
-        d = _distances(case, frames.moved_about(case.centre, x.reshape(-1, 6), case.start), thickness * points)
-        if d is None:
+    for _ in range(_STEPS):
+        found = case.distances(x, thickness * points)
+        if found is None:
             return None
-        e = d.e + thickness * d.cosine * points[d.index]
-        member = np.full(len(e), kind == "whole")
-        edge = np.zeros(len(e), bool)
-        if kind == "whole" and step == 0:
-            thickness = float(np.median(e))
-        elif kind == "region":
-            thickness, member, edge = _region(scan.points[d.index], e, thickness, case.sigma)
+        e, weight, index, cosine, by_twists = found
+        e = e + thickness * cosine * points[index]
+        member, edge = np.zeros((2, len(e)), bool)
+        if kind == "stock":
+            thickness, member, edge = _region(scan.points[index], e, thickness, case.sigma)
         if member.any():
-            points = member[KDTree(scan.points[d.index]).query(scan.points)[1]]
-        column = -d.cosine * member
-        left = e + thickness * column
-        weight = d.weight * tukey(left, case.sigma) * ~edge / (case.sigma**2 * case.factor)
-        H, pulls = _normal_equations(case, d, column, weight * left, weight)
-        prior = case.H + K
-        H[:-1, :-1] += prior
+            points = member[KDTree(scan.points[index]).query(scan.points)[1]]
+        rows = np.column_stack([by_twists, -cosine * member])
+        left = e + thickness * rows[:, -1]
+        scale = max(case.sigma, min(scale, mad_sigma(left)))
+        w = weight * tukey(left, scale) * ~edge / (case.sigma**2 * case.factor)
+        H = (rows.T * w) @ rows
+        H[:-1, :-1] += case.H + K
+        pulls = rows * (w * left)[:, None]
         gradient = pulls.sum(axis=0)
         gradient[:-1] += case.b + case.H @ x + K @ (case.twists + x)
-        change = -_solve(H, gradient)
+        change = -symmetric_inverse(H) @ gradient
         x = x + change[:-1]
         thickness += float(change[-1])
-        if max(np.abs(change[:-1].reshape(-1, 6)[:, 3:]).max(), abs(change[-1])) < _CONVERGED * case.sigma:
+        far = max(np.abs(change[:-1].reshape(-1, 6)[:, 3:]).max(), abs(change[-1]))
+        if scale == case.sigma and far < _CONVERGED * case.sigma:
             break
-    assert d is not None
+        if far < _NEAR * scale:
+            scale /= 2
     t = case.twists + x
     held = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
-    own = slice(6 * case.view, 6 * case.view + 6)
-    independent = (d.rows**2).T @ (weight * left) ** 2
-    return _Fit(
-        thickness,
-        _thickness_sigma(H, prior, pulls),
-        points,
-        float(scan.area[points].sum() / scan.area.sum()),
-        _log_density(case, left) @ d.weight / d.weight.mean() / case.factor - held,
-        float(np.median((pulls[:, own] ** 2).sum(axis=0) / np.maximum(independent, 1e-300))),
-        _gain_over_torn(case, d, e, left, member & ~edge) if kind == "region" and member.any() else np.inf,
-    )
+    share = float(scan.area[points].sum() / scan.area.sum())
+    of_patches = np.zeros((len(e), len(H)))
+    np.add.at(of_patches, _patches(scan, index), pulls)
+    gain = symmetric_inverse(H)[-1]
+    scattered = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
+    sigma = float(np.sqrt(max(scattered, gain[-1])))
+    inside = member & ~edge
+    own = rows[:, 6 * case.view : 6 * case.view + 6]
+    over_torn = _over_torn(case, *(column[inside] for column in (own, e, left, weight))) if inside.any() else np.inf
+    return _Fit(thickness, sigma, points, share, _evidence(case, left, weight) - held, over_torn)
 
 
-def _gain_over_torn(case: _Case, d: _Distances, e: Array, left: Array, member: Mask) -> float:
+def _evidence(case: _Case, left: Array, weight: Array) -> float:
+    """Return the log likelihood of what is left of distances (M,) over that of as many strays."""
+    normal = np.exp(-0.5 * (left / case.sigma) ** 2) / (np.sqrt(2 * np.pi) * case.sigma)
+    likelier = np.log1p((1 - _STRAY) / _STRAY * 2 * case.gate * normal)
+    return float(likelier @ weight / weight.mean() / case.factor)
+
+
+def _over_torn(case: _Case, rows: Array, e: Array, left: Array, weight: Array) -> float:
     """Return the log evidence of stock on a region over any motion of the region by itself, as of a torn scan.
 
     A motion has six numbers where stock has one, and distances show each of them (Schwarz 1978, Ann. Stat. 6:461).
 
     Args:
+        rows: (M, 6) change of the region's distances by a motion of it.
         e: (M,) distances, with the stock.
         left: (M,) what it leaves of them.
-        member: (M,) which are of the region.
     """
-    rows, off, weight = d.rows[member], e[member], d.weight[member]
-    still = left[member]
-    for _ in range(_STEPS):
-        w = weight * tukey(still, case.sigma)
-        motion = _solve((rows * w[:, None]).T @ rows, (rows * w[:, None]).T @ off)
-        still = off - rows @ motion
-    difference = _log_density(case, left[member]) - _log_density(case, still)
-    gain = float(weight @ difference / d.weight.mean() / case.factor)
-    return gain + (6 - 1) / 2 * float(np.log(max(len(off) / case.factor, 1.0)))
-
-
-def _thickness_sigma(H: Array, prior: Array, pulls: Array) -> float:
-    """Return the sigma of the last unknown, from what patches pull (P, n), or of independent distances if that is more.
-
-    Args:
-        H: (n, n) information of all unknowns.
-        prior: (n − 1, n − 1) the part of it that no distance of the view adds.
-    """
-    gain = _solve(H, np.eye(len(H))[-1])
-    scattered = gain[:-1] @ prior @ gain[:-1] + np.sum((pulls @ gain) ** 2)
-    return float(np.sqrt(max(scattered, gain[-1])))
-
-
-def _log_density(case: _Case, left: Array) -> Array:
-    """Return (M,) log densities of what is left of distances."""
-    normal = np.exp(-0.5 * (left / case.sigma) ** 2) / (np.sqrt(2 * np.pi) * case.sigma)
-    return np.log((1 - _STRAY) * normal + _STRAY / (2 * case.gate))
-
-
-def _distances(case: _Case, poses: Array, offset: Array) -> _Distances | None:
-    """Return the view's distances from the others, its points taken back along their normals by an offset (N,); None
-    for too few."""
-    scan = case.capture.scans[case.view]
-    if offset.any():
-        moved = scan.points - offset[:, None] * scan.normals
-        scan = replace(scan, points=moved, tree=KDTree(moved, leafsize=16))
-    scans = [scan if v == case.view else other for v, other in enumerate(case.capture.scans)]
-    samples = [sample_points(other, _SAMPLES) for other in scans]
-    matches = match_pairs(scans, poses, [(case.view, w) for w in case.partners], case.gate, samples)[0]
-    if sum(len(m.residual) for m in matches) < _FEWEST:
-        return None
-    index = np.concatenate([m.index_v for m in matches])
-    normal = np.concatenate([m.normal for m in matches])
-    middle = np.concatenate([m.middle for m in matches])
-    cosine = np.einsum("ni,ni->n", frames.rotate(poses[case.view], scan.normals[index]), normal)
-    e = np.concatenate([m.residual for m in matches])
-    weight = np.concatenate([m.weight for m in matches])
-    return _Distances(matches, e, weight, index, cosine, frames.plane_rows(middle - case.centre, normal))
+    moved = left
+    for _ in range(_TORN_STEPS):
+        weighted = rows.T * (weight * tukey(moved, case.sigma))
+        moved = e - rows @ symmetric_inverse(weighted @ rows) @ (weighted @ e)
+    gain = _evidence(case, left, weight) - _evidence(case, moved, weight)
+    return gain + (6 - 1) / 2 * float(np.log(max(len(e) / case.factor, 1.0)))
 
 
 def _region(places: Array, e: Array, thickness: float, sigma: float) -> tuple[float, Mask, Mask]:
@@ -454,41 +410,6 @@ def _region(places: Array, e: Array, thickness: float, sigma: float) -> tuple[fl
         member = member[around].mean(axis=1) > 0.5
     mixed = member[around].mean(axis=1)
     return thickness, member, (mixed > _PURE) & (mixed < 1 - _PURE)
-
-
-def _normal_equations(case: _Case, d: _Distances, column: Array, pull: Array, weight: Array) -> tuple[Array, Array]:
-    """Return H (6V + 1, 6V + 1), and the parts of its gradient by patches (P, 6V + 1), of a view's distances.
-
-    Args:
-        column: (M,) change of a distance by a unit of stock.
-        pull: (M,) what is left of the distances, times their weight.
-        weight: (M,) inverse variances.
-    """
-    size = case.H.shape[0] + 1
-    H = np.zeros((size, size))
-    patch = _patches(case.capture.scans[case.view], d.index)
-    sums = np.zeros((int(patch.max()) + 1, size))
-    own = slice(6 * case.view, 6 * case.view + 6)
-    ends = np.cumsum([len(m.residual) for m in d.matches])
-    for m, end in zip(d.matches, ends, strict=True):
-        part = slice(end - len(m.residual), end)
-        B, w, s = d.rows[part], weight[part], column[part]
-        other = slice(6 * m.w, 6 * m.w + 6)
-        square = (B * w[:, None]).T @ B
-        mixed = B.T @ (w * s)
-        H[own, own] += square
-        H[other, other] += square
-        H[own, other] -= square
-        H[other, own] -= square
-        H[own, -1] += mixed
-        H[other, -1] -= mixed
-        H[-1, -1] += float(w @ s**2)
-        pulls = B * pull[part, None]
-        np.add.at(sums[:, own], patch[part], pulls)
-        np.subtract.at(sums[:, other], patch[part], pulls)
-        np.add.at(sums[:, -1], patch[part], s * pull[part])
-    H[-1, :-1] = H[:-1, -1]
-    return H, sums
 
 
 def _patches(scan: Scan, index: Indices) -> Indices:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.session.axes import Axes
@@ -332,7 +333,11 @@ def intensity_scale(session: SessionData) -> tuple[float, float] | None:
 
 
 def views_of(session: SessionData) -> Views:
-    """Collect what effects may know; joints count only where the robot's kinematics are known too."""
+    """Collect what effects may know; joints count only where the robot's kinematics are known too.
+
+    Raises:
+        InputError: times fall from view to view.
+    """
     views = session.views
     axes = axes_of(session)
     scanners = scanners_of(session)
@@ -341,6 +346,9 @@ def views_of(session: SessionData) -> Views:
     joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
     approach = np.array([view.approach for view in views]) if has_joints else np.zeros((count, 0))
     time = np.array([np.nan if view.time_s is None else view.time_s for view in views])
+    falls = np.flatnonzero(time < np.fmax.accumulate(time))
+    if falls.size:
+        raise InputError(f"{session.name}: time_s of view {views[falls[0]].name} falls; to fix: sort the views by time")
     # A column with a gap does not count.
     complete = set.intersection(*(set(view.covariates) for view in views))
     covariates = {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}

@@ -1,5 +1,6 @@
 """Stock on one view, against nature's castings: said with its thickness; a displaced or torn view never is."""
 
+import json
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import stitch
+from data_synth import kinematics
 from data_synth.fixtures import quiet_scenes
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
@@ -37,8 +39,9 @@ def with_casting(size, share):
 
 
 def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
-    """It is taken off where it is; a run that was saved knows it again."""
-    write_session(tmp_path / "session", with_casting(0.2, 0.5), "blade")
+    """It is taken off where it is; a run that was saved knows it again. The pose is as near the truth as is stated."""
+    measured = with_casting(0.2, 0.5)
+    write_session(tmp_path / "session", measured, "blade")
     found = stitch.run(stitch.load_session(tmp_path / "session"))
     (scan,) = (scan for scan in found.measurement.capture.scans if scan.stock is not None)
     assert found.session.names[found.measurement.capture.scans.index(scan)] == "v008"
@@ -49,6 +52,14 @@ def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     (again,) = (s for s in stitch.load_run(tmp_path / "run").measurement.capture.scans if s.stock is not None)
     assert again.stock.thickness == pytest.approx(scan.stock.thickness)
     assert np.mean(again.stock.points == scan.stock.points) > 0.98
+    (row,) = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))["stock"]
+    middle = frames.transform(found.poses[VIEW], scan.points.mean(axis=0)[None])[0]
+    to_middle = frames.make(np.eye(3), -middle)
+    off = frames.log(to_middle @ found.poses @ frames.inverse(to_middle @ measured.T_reference_scanner))
+    error = off[VIEW] - np.delete(off, VIEW, axis=0).mean(axis=0)
+    assert (np.abs(error) < 3 * np.array(row["pose_sigma"])).all()
+    # As 20 µm of the arm, far less than the stock.
+    assert max(row["pose_sigma"][3:]) < 0.03
 
 
 @pytest.mark.parametrize("turn", [0.0, 3e-3])
@@ -57,6 +68,18 @@ def test_a_displaced_view_is_never_called_stock(turn):
     T = np.array(measured.T_base_flange)
     T[VIEW] = T[VIEW] @ frames.exp(np.array([turn, 0, 0, 0.1, 0.2, -0.2]))
     found = run(session_of(replace(measured, T_base_flange=T)))
+    assert not any("stock" in doubt for doubt in found.doubts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.005, 0.02])
+def test_poses_that_are_read_late_are_no_stock(share):
+    """Each is read a share of the way from the one before, as the arm goes by its joints."""
+    measured = measured_blade(9000, views=16, pixels=60)
+    q = measured.plan.joints
+    way = np.random.default_rng([9000, 3]).uniform(0, share, len(q))[:, None] * (np.roll(q, 1, axis=0) - q)
+    true, read = (kinematics.flange(measured.scene.arm, joints) for joints in (q, q + way))
+    found = run(session_of(replace(measured, T_base_flange=measured.T_base_flange @ frames.inverse(true) @ read)))
     assert not any("stock" in doubt for doubt in found.doubts)
 
 

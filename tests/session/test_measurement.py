@@ -8,6 +8,7 @@ import pytest
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
 from stitch.api.check import session_summary
 from stitch.api.pipeline import run
+from stitch.errors import InputError
 from stitch.session.measurement import views_of
 from stitch.session.notes import gaps_note, payload_note
 from stitch.session.torques import torques_of
@@ -134,3 +135,12 @@ def test_so_is_a_time_or_a_pose_of_joints_that_is_missing_once():
     views = [*session.views[:4], replace(session.views[4], time_s=None, joints=None)]
     told = gaps_note(replace(session, views=views))
     assert ("time_s" in told) == any(v.time_s is not None for v in views) and "joint angles (" in told
+
+
+def test_times_that_fall_are_refused_by_the_view():
+    """A folder's are when it is read; those of a session that a program changed, when they are first asked for."""
+    session = labelled_cell(0, views=6)[0]
+    times = (5.0, 6.0, None, 5.5, 7.0, 8.0)
+    views = tuple(replace(view, time_s=t) for view, t in zip(session.views, times, strict=True))
+    with pytest.raises(InputError, match=f"time_s of view {views[3].name} falls"):
+        views_of(replace(session, views=views))
