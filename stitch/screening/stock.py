@@ -219,9 +219,8 @@ def stock_of(
     if abs(best.thickness) < max(_LEAST * case.sigma, _SURE * best.sigma, _TIMES_SCATTER * case.scatter):
         return None
     rivals = [fit.evidence for fit in (_fit(case, "moved"), _fit(case, "still")) if fit is not None]
-    if best.evidence < max(rivals, default=-np.inf) + _MARGIN:
-        return None
-    return Stock(best.thickness, best.sigma, best.share, best.points)
+    is_clear = best.evidence > max(rivals, default=-np.inf) + _MARGIN
+    return Stock(best.thickness, best.sigma, best.share, best.points) if is_clear else None
 
 
 @dataclass(frozen=True)
@@ -361,10 +360,10 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
     np.add.at(of_patches, _patches(scan, index), pulls)
     gain = symmetric_inverse(H)[-1]
     scattered = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
-    sigma = float(np.sqrt(max(scattered, gain[-1])))
     inside = member & ~edge
     own = rows[:, 6 * case.view : 6 * case.view + 6]
     over_torn = _over_torn(case, *(column[inside] for column in (own, e, left, weight))) if inside.any() else np.inf
+    sigma = float(np.sqrt(max(scattered, gain[-1])))
     return _Fit(thickness, sigma, points, share, _evidence(case, left, weight) - held, over_torn)
 
 

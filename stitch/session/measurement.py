@@ -346,8 +346,7 @@ def views_of(session: SessionData) -> Views:
     joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
     approach = np.array([view.approach for view in views]) if has_joints else np.zeros((count, 0))
     time = np.array([np.nan if view.time_s is None else view.time_s for view in views])
-    falls = np.flatnonzero(time < np.fmax.accumulate(time))
-    if falls.size:
+    if (falls := np.flatnonzero(time < np.fmax.accumulate(time))).size:
         raise InputError(f"{session.name}: time_s of view {views[falls[0]].name} falls; to fix: sort the views by time")
     # A column with a gap does not count.
     complete = set.intersection(*(set(view.covariates) for view in views))
