@@ -182,7 +182,8 @@ def summary(rows: list[Row]) -> list[str]:
     groups = with_all(grouped(sorted(hidden, key=lambda row: row["size"]), "size"))
     groups["no law"] = [row for row in judged if row["law"] == "nothing"]
     head = (
-        "cells | certain, wrong | perhaps, wrong | law wrong | certain, right or kin | right name, kin or law | place"
+        "cells | certain, wrong | perhaps, wrong | law wrong | certain, right or kin | the same or one law, right | "
+        "right name, kin or law | place"
     )
     told = [(name, *_shares(group)) for name, group in groups.items()]
     silent = (
@@ -204,8 +205,13 @@ def summary(rows: list[Row]) -> list[str]:
 
 def _shares(rows: list[Row]) -> Iterator[str]:
     right = {"certain right", "perhaps right", "certain kin", "perhaps kin", "law right"}
-    wanted = ({"certain wrong"}, {"perhaps wrong"}, {"law wrong"}, {"certain right", "certain kin"}, right)
-    for words in (*wanted, right | {"law at the right place"}):
+    certain = {"certain right", "certain kin"}
+    wanted = ({"certain wrong"}, {"perhaps wrong"}, {"law wrong"}, certain)
+    for words in wanted:
+        yield share(row["outcome"] in words for row in rows)
+    # A law that is told alone is 20 to 1 over every other.
+    yield share(row["outcome"] in certain or (row["outcome"] == "law right" and len(row["laws"]) == 1) for row in rows)
+    for words in (right, right | {"law at the right place"}):
         yield share(row["outcome"] in words for row in rows)
 
 

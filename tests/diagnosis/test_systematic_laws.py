@@ -12,7 +12,7 @@ from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.evidence import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
-from stitch.diagnosis.systematic_laws import STEP, dictionary_of, law_of, law_size, rank_laws
+from stitch.diagnosis.systematic_laws import GRAVITY, STEP, dictionary_of, law_of, law_size, rank_laws
 from stitch.effects.contract import EFFECTS, effect, twist
 from stitch.numerics.reml import fit_variances
 
@@ -53,6 +53,7 @@ def shown(linear, column):
         ("joint 4", "j2_move_deg", "joint 4 follows j2_move_deg (in proportion)"),
         ("the scanner's stand or the base", STEP, "the scanner's stand or the base sits displaced from view v12 on"),
         ("the part on the flange", "payload_kg", "the part on the flange follows payload_kg (a line)"),
+        ("the part on the flange", GRAVITY, "the part on the flange follows gravity (a step as it falls along y)"),
     ],
 )
 def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, words):
