@@ -58,17 +58,13 @@ def import_command(
       stitch import scan.ls -o views.csv --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
       stitch import poses.txt -o views.csv --columns x,y,z,rx,ry,rz --rotation xyz-extrinsic --angles deg
     """
-    from stitch.plugins.intake.controllers.program import import_file
-    from stitch.plugins.intake.import_table import import_table, is_table_of_poses
+    from stitch.plugins.intake.import_table import import_export
     from stitch.plugins.intake.readings import StatedTable
     from stitch.system.files import whole_file
 
     require_new(output)
     stated = StatedTable(split_names(columns), rotation, angles, length_unit=file_unit, inverse=inverse or None)
-    if stated != StatedTable() or is_table_of_poses(file):
-        imported = import_table(file, unit, stated)
-    else:
-        imported = import_file(file, unit, frame, tool)
+    imported = import_export(file, unit, stated, frame, tool)
     if output is None:
         results_stream().write(imported.text)
     else:

@@ -1,60 +1,102 @@
 """A table of poses or joint angles -> the text of views.csv; no scans to ask: what the file does not say, flags say."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.output.session_files import table_text
-from stitch.plugins.intake.controllers import tracker_csv, universal_robots
-from stitch.plugins.intake.controllers.program import POSE_COLUMNS, ImportedTable, numbered_names, pose_cells
+from stitch.output.session_files import pose_columns, table_text
+from stitch.plugins.intake.column_names import bare_name, read_names
+from stitch.plugins.intake.controllers.program import ImportedTable, import_file, numbered_names
 from stitch.plugins.intake.layouts import POSE_UNITS, ColumnLayout, covariate_columns, pose_units, possible_layouts
-from stitch.plugins.intake.pose_tables import read_number_table
-from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, RawPoses, read_raw_poses
+from stitch.plugins.intake.raw_poses import RawPoses, is_program, read_raw_poses
 from stitch.plugins.intake.readings import Reading, StatedTable, angle_units, readings
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 
-
-def is_table_of_poses(file: Path) -> bool:
-    """False for robot programs, recordings of a UR and exports of trackers, which have readers of their own."""
-    suffix = file.suffix.lower()
-    if suffix in STRUCTURED:
-        return True
-    if suffix in PROGRAMS or not file.is_file():
-        return False
-    try:
-        table = read_number_table(file)
-    except InputError:
-        return False
-    if suffix != ".csv" or table.header is None:
-        return True
-    told = file.read_text(encoding="utf-8-sig", errors="replace")
-    names, _ = tracker_csv.split_header(told)
-    return not universal_robots.is_recording(told) and not all(axis in names for axis in "xyz")
+# Of a quaternion with two digits.
+_UNIT_LENGTH = 0.02
+# Columns that name what was measured; how trackers turn their probes.
+_NAMES = ("name", "point", "pointname", "target", "id", "view", "measurement")
+_OF_TRACKERS = (
+    "quaternion by its letters, or Rx, Ry, Rz in degrees about fixed x, y, z: Rz·Ry·Rx; mm or m by the header"
+)
 
 
-def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:
-    """Read a table of poses, or of joint angles, or of both.
+def import_export(
+    file: Path, unit: str, stated: StatedTable, frame: str | None = None, tool: str | None = None
+) -> ImportedTable:
+    """Read a robot program, or a table: of measured places where it is a .csv with x, y, z, else of poses or joints.
 
     Args:
         unit: "mm" or "m", the session's length_unit.
+        frame, tool: of a program, see `import_file`.
+
+    Raises:
+        InputError: as the reader does.
+    """
+    if unit not in METRES:
+        raise InputError(f"--unit {unit}: use mm or m")
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; to fix: name an export of the controller")
+    if stated == StatedTable() and (is_program(file) or file.suffix.lower() == ".jbi"):
+        return import_file(file, unit, frame, tool)
+    raw = read_raw_poses([file])
+    plain = [bare_name(name)[0] for name in raw.header or ()]
+    if stated == StatedTable() and file.suffix.lower() == ".csv" and {*"xyz"} <= {*plain}:
+        return _import_measured(file, raw, unit)
+    return import_table(file, raw, unit, stated)
+
+
+def _import_measured(file: Path, raw: RawPoses, unit: str) -> ImportedTable:
+    """Return frames.csv of 6D probes, or points.csv of reflectors, a new view whenever a name comes again."""
+    named = read_names(raw.header or ())
+    if len(named.rotation) == 3 and named.angle_unit is None:
+        raise InputError(
+            f"{file}: rx, ry, rz may be degrees or a rotation vector; to fix: write Rx (deg) … for a tracker's angles, "
+            "actual_TCP_pose_0 … for a UR's pose"
+        )
+    numbered = next(
+        (x for name, x in zip(raw.header or (), raw.numbers.T, strict=True) if name.lower() in _NAMES), None
+    )
+    counted = range(1, len(raw.numbers) + 1) if numbered is None else numbered
+    names = [texts[0] if texts else f"{i:g}" for texts, i in zip(raw.labels, counted, strict=True)]
+    position = raw.numbers[:, named.position] * (POSE_UNITS[named.length_unit or "mm"] / METRES[unit])
+    if named.rotation:
+        layout = replace(possible_layouts(raw)[0], position=position)
+        size = np.linalg.norm(layout.rotation, axis=1)
+        if layout.rotation.shape[1] == 4 and np.abs(size - 1).max() > _UNIT_LENGTH:
+            odd = int(np.abs(size - 1).argmax())
+            raise InputError(f"{file} row {odd + 1}: quaternion of length {size[odd]:.5g}; to fix: write a unit one")
+        angles = "xyz-extrinsic" if layout.rotation.shape[1] == 3 else None
+        T = readings(layout, angles, layout.angle_unit)[0].T
+        columns: dict[str, Sequence[object]] = {"view": numbered_names(names), **_listed(pose_columns(T))}
+        return ImportedTable("frames.csv", table_text(columns), len(T), _OF_TRACKERS, ())
+    views = [f"v{names[: i + 1].count(name)}" for i, name in enumerate(names)]
+    columns = {"view": views, "target": names, **_listed(dict(zip("xyz", position.T, strict=True)))}
+    note = (
+        "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
+    )
+    return ImportedTable("points.csv", table_text(columns), len(names), _OF_TRACKERS, (note,))
+
+
+def import_table(file: Path, raw: RawPoses, unit: str, stated: StatedTable) -> ImportedTable:
+    """Return a table of poses, or of joint angles, or of both.
 
     Raises:
         InputError: no poses, or what the file does not say and no flag states; names the flag.
     """
-    if unit not in METRES:
-        raise InputError(f"--unit {unit}: use mm or m")
-    raw = read_raw_poses([file])
     raw = raw.renamed(stated.columns) if stated.columns else raw
     found = possible_layouts(raw)
     if len(found) > 1:
         ways = "; or ".join(layout.words for layout in found)
         raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
     layout = found[0]
-    columns: dict[str, Sequence[str]] = {"view": _view_names(raw)}
+    columns: dict[str, Sequence[object]] = {"view": _view_names(raw)}
     count, words = len(columns["view"]), []
     if (clouds := _cloud_names(raw)) is not None:
         columns["cloud"] = clouds
@@ -67,7 +109,7 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:
         file_unit = _table_unit(file, layout, stated)
         T = frames.inverse(reading.T) if stated.inverse else reading.T
         scale = POSE_UNITS[file_unit] / METRES[unit]
-        columns |= zip(POSE_COLUMNS, zip(*(pose_cells(pose, scale) for pose in T), strict=True), strict=True)
+        columns |= _listed(pose_columns(frames.make(T[:, :3, :3], T[:, :3, 3] * scale)))
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
         )
@@ -75,6 +117,10 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:
     # How times of day were read, or why they are left out.
     warnings = (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
     return ImportedTable("views.csv", table_text(columns), count, "; ".join(words), warnings)
+
+
+def _listed(columns: Mapping[str, Array]) -> dict[str, list[object]]:
+    return {name: list(values) for name, values in columns.items()}
 
 
 def _view_names(raw: RawPoses) -> list[str]:

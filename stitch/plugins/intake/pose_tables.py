@@ -16,7 +16,7 @@ from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import is_time_of_day
 from stitch.plugins.intake.column_names import bare_name
 from stitch.plugins.intake.refusals import Fix, Refusal, change
-from stitch.session.reading.text_files import read_any_text, shortened
+from stitch.session.reading.text_files import shortened
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -128,7 +128,6 @@ _LONGEST_LINE = 100_000
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ \u202f\xa0\u2009]\d{3})+[.,]\d+)")
 _COMMENTS = ("#", "%", "//")
 _COORDINATES = {*"xyz", "rx", "ry", "rz", "rotx", "roty", "rotz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
-_MAX_TABLE_MB = 50
 
 
 @dataclass(frozen=True)
@@ -143,17 +142,12 @@ class NumberTable:
     words: str  # how it was read
 
 
-def read_number_table(file: Path) -> NumberTable:
-    """Read a table of numbers.
+def parse_number_table(file: Path, content: str) -> NumberTable:
+    """Read a table of numbers from the text of a file.
 
     Raises:
         InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
     """
-    return parse_number_table(file, read_any_text(file, "name a table of poses", _MAX_TABLE_MB))
-
-
-def parse_number_table(file: Path, content: str) -> NumberTable:
-    """The same of a text that was read from a file."""
     lines = [(i, line.strip()) for i, line in enumerate(content.replace("\u2212", "-").splitlines(), 1)]
     kept = [(i, line) for i, line in lines if line and not _RULE.fullmatch(line)]
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
@@ -266,9 +260,10 @@ def _require_numbers(file: Path, header: list[str] | None, rows: NumberedRows, t
         for line, row in rows:
             if _THOUSANDS.fullmatch(row[c]):
                 raise _has_marks(file, line, row[c])
-            if bare_name(name)[0] in _COORDINATES and re.match(r"[+-]?\d", row[c]):
-                told = f"{file} line {line}: {shortened(row[c])} in column {name} is no number"
-                raise Refusal(told, change(file, "write numbers there"))
+        if bare_name(name)[0] in _COORDINATES and any(re.match(r"[+-]?\d", row[c]) for _, row in rows):
+            line, cell = next((line, row[c]) for line, row in rows if parse_number(row[c]) is None)
+            told = f"{file} line {line}: {shortened(cell)} in column {name} is no number"
+            raise Refusal(told, change(file, "write numbers there"))
 
 
 def _has_marks(file: Path, line: int, cell: str) -> Refusal:

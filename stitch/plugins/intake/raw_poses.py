@@ -289,7 +289,7 @@ def _axis_times_angle(header: tuple[str, ...], numbers: Array) -> tuple[tuple[st
 def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     """4×4 or 3×4 matrices over several lines each, or one position above its angles; None if it is none of that."""
     x = table.numbers
-    if x.shape == (2, 3):
+    if x.shape == (2, 3) and table.header is None:
         of_3dtk = table.file.with_suffix(".3d").exists()
         words = (
             "a pose of 3DTK, z the other way round as of its scans" if of_3dtk else "position and angles, a line each"

@@ -87,3 +87,51 @@ def test_what_the_file_does_not_say_is_asked_for_by_its_flag(imported, name, tex
 def test_programs_and_trackers_keep_their_readers(imported):
     code, rows, err = imported("t.csv", "name,x,y,z\na,1,2,3\nb,2,3,4\n")
     assert code == 0 and rows[0]["target"] == "a" and "points.csv" in err
+
+
+def test_a_tracker_probe_with_decimal_commas(imported):
+    text = "Name;X [m];Y [m];Z [m];Q0;Q1;Q2;Q3\nm1;1,5;-2,25;0,125;0,7071068;0;0,7071068;0\n"
+    _, rows, err = imported("tmac.csv", text)
+    assert "frames.csv" in err and rows[0]["view"] == "m1"
+    assert [float(rows[0][c]) for c in ("x", "y", "z")] == pytest.approx([1500, -2250, 125])
+    q = [float(rows[0][c]) for c in ("qx", "qy", "qz", "qw")]
+    assert q == pytest.approx([0, np.sqrt(0.5), 0, np.sqrt(0.5)], abs=1e-7)
+
+
+def test_angles_of_a_tracker_turn_about_fixed_axes(imported):
+    _, rows, _ = imported("probe.csv", "id,x,y,z,Rx (deg),Ry (deg),Rz (deg)\na,1,2,3,10,20,30\nb,1,2,4,10,20,30\n")
+    turn = Rotation.from_quat([float(rows[0][c]) for c in ("qx", "qy", "qz", "qw")]).as_matrix()
+    turns = [Rotation.from_rotvec(np.radians(v)).as_matrix() for v in ([0, 0, 30], [0, 20, 0], [10, 0, 0])]
+    assert np.allclose(turn, turns[0] @ turns[1] @ turns[2], atol=1e-8)
+
+
+def test_reflectors_begin_a_view_where_a_name_comes_again(imported):
+    _, rows, err = imported("points.csv", "Point,X,Y,Z\nT1,1,2,3\nT2,4,5,6\nT1,1,2,4\n")
+    assert "points.csv" in err
+    assert [(row["view"], row["target"], float(row["z"])) for row in rows] == [
+        ("v1", "T1", 3),
+        ("v1", "T2", 6),
+        ("v2", "T1", 4),
+    ]
+
+
+def test_a_recording_of_universal_robots_in_metres(imported):
+    header = " ".join(["timestamp", *(f"actual_q_{i}" for i in range(6)), *(f"actual_TCP_pose_{i}" for i in range(6))])
+    rows = "\n0.008 0 0 0 0 0 1 0.1 0.2 0.3 0 0 0\n0.016 0 0 0 0 0 2 0.4 0.5 0.6 0 0 0.5\n"
+    code, table, _ = imported("record.csv", header + rows, "--unit", "m", "--angles", "rad")
+    assert code == 0 and [float(table[1][c]) for c in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
+    assert float(table[1]["j6_deg"]) == pytest.approx(np.degrees(2))
+    assert float(table[1]["qz"]) == pytest.approx(np.sin(0.25))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x,y,z\n1,2,oops\n3,4,5\n", "oops"),
+        ("x,y,z,qw,qx,qy,qz\n1,2,3,1,1,0,0\n2,2,3,1,1,0,0\n", "quaternion of length 1.41"),
+        ("x,y,z,rx,ry,rz\n1,2,3,0,0,1\n2,2,3,0,0,1\n", "may be degrees or a rotation vector"),
+    ],
+)
+def test_exports_that_do_not_say_what_they_hold_are_refused(imported, text, told):
+    code, rows, err = imported("a.csv", text)
+    assert code == 2 and told in err and not rows

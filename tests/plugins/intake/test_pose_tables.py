@@ -15,13 +15,18 @@ from stitch.plugins.intake.cloud_pairs import pairings
 from stitch.plugins.intake.first_session import first_session
 from stitch.plugins.intake.folder_files import find_folder_files
 from stitch.plugins.intake.layouts import covariate_columns, possible_layouts
-from stitch.plugins.intake.pose_tables import parse_number_table, read_number_table
+from stitch.plugins.intake.pose_tables import parse_number_table
 from stitch.plugins.intake.raw_poses import read_raw_poses
 from stitch.plugins.intake.session_draft import write_draft
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.session_folder import load_session
+from stitch.session.reading.text_files import read_any_text
 
 ROWS = [[111.5, -331.25, 317.0, -2.5, 0.125, 3.0], [114.0, -358.5, 360.75, -2.75, 0.25, -3.0]]
+
+
+def read_number_table(file):
+    return parse_number_table(file, read_any_text(file, "name a table"))
 
 
 def written(row, separator, comma):

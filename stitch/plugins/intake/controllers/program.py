@@ -13,9 +13,8 @@ import numpy as np
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.controllers import abb, fanuc, kuka, tracker_csv, universal_robots, yaskawa
+from stitch.plugins.intake.controllers import abb, fanuc, kuka, universal_robots, yaskawa
 from stitch.plugins.intake.controllers.taught_points import TaughtPoint, line_of, program_text, without_comments
-from stitch.plugins.intake.controllers.tracker_csv import TrackerPoint
 from stitch.session.reading.csv_files import is_number
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -200,7 +199,6 @@ def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
     return told[0].frame if len(told) == len(posed) else ""
 
 
-_READERS = PROGRAMS | {".csv": universal_robots}
 # Programs are in mm; views.csv is in the session's length_unit.
 _MM_IN_UNIT = {"mm": 1.0, "m": 1e-3}
 
@@ -217,7 +215,7 @@ class ImportedTable:
 
 
 def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: str | None = None) -> ImportedTable:
-    """Read a program or an export of a tracker.
+    """Read a program.
 
     Args:
         unit: "mm" or "m", the session's length_unit.
@@ -228,21 +226,12 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
         InputError: unknown or broken file, points of different frames; names the line and how to fix it.
         NoResultError: no points in the file.
     """
-    if not file.is_file():
-        raise InputError(f"{file}: no such file; to fix: name an export of the controller")
     if unit not in _MM_IN_UNIT:
         raise InputError(f"--unit {unit}: is no unit of a program; to fix: use mm or m")
-    reader = _READERS.get(file.suffix.lower())
-    if reader is None:
-        raise InputError(
-            f"{file}: unknown kind {file.suffix!r}; known are {', '.join(_READERS)}; to fix: save it as one of these, "
-            f"or let `stitch init {file.parent}` read the folder, if it is a scan"
-        )
+    reader = PROGRAMS[file.suffix.lower()]
     text = file.read_text(encoding="utf-8-sig", errors="replace")
     if not text.strip():
         raise InputError(f"{file}: empty; to fix: export it again")
-    if reader is universal_robots and file.suffix.lower() == ".csv" and not universal_robots.is_recording(text):
-        return _import_tracker(file, text, unit)
     points: Sequence[TaughtPoint] = reader.read(file, text)
     if not points:
         raise NoResultError(f"{file}: no taught points found; to fix: export the program with its positions")
@@ -264,26 +253,3 @@ def _check_frames(file: Path, points: Sequence[TaughtPoint], frame: str | None, 
             "unless both were zero, else they are not the flange in the base",
         )
     return ()
-
-
-def _import_tracker(file: Path, text: str, unit: str) -> ImportedTable:
-    """Return frames.csv of 6D probes, or points.csv of reflectors, a new view whenever a name comes again."""
-    measured: list[TrackerPoint] = tracker_csv.read(file, text)
-    if not measured:
-        raise NoResultError(f"{file}: no measurements; to fix: export them again")
-    scale = _MM_IN_UNIT[unit]
-    poses = [m.T_sensor_probe for m in measured if m.T_sensor_probe is not None]
-    if poses:
-        rows = [["view", *POSE_COLUMNS]]
-        rows += [
-            [n, *pose_cells(T, scale)] for n, T in zip(numbered_names(m.name for m in measured), poses, strict=True)
-        ]
-        return ImportedTable("frames.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, ())
-    rows, seen = [["view", "target", "x", "y", "z"]], Counter[str]()
-    for m in measured:
-        seen[m.name] += 1
-        rows.append([f"v{seen[m.name]}", m.name, *(f"{x * scale:.9g}" for x in m.position)])
-    note = (
-        "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
-    )
-    return ImportedTable("points.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, (note,))

@@ -131,15 +131,6 @@ def test_ur_script(tmp_path):
     assert table[2]["x"] == "" and float(table[2]["j2_deg"]) == pytest.approx(np.degrees(-1.57))
 
 
-def test_ur_recording_in_metres(tmp_path):
-    header = " ".join(["timestamp", *(f"actual_q_{i}" for i in range(6)), *(f"actual_TCP_pose_{i}" for i in range(6))])
-    file = tmp_path / "record.csv"
-    file.write_text(header + "\n0.008 0 0 0 0 0 1 0.1 0.2 0.3 0 0 0\n0.016 0 0 0 0 0 2 0.4 0.5 0.6 0 0 0.5\n")
-    table = list(csv.DictReader(io.StringIO(import_file(file, unit="m").text)))
-    assert [float(table[1][c]) for c in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
-    assert float(table[1]["j6_deg"]) == pytest.approx(np.degrees(2))
-
-
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -156,11 +147,6 @@ def test_ur_recording_in_metres(tmp_path):
         ("a.src", "LIN {X 1,5,Y 0,Z 0,A 0,B 0,C 0}\n", r"a.src line 1: line1 has '5' between its commas"),
         ("a.src", "LIN {X 1.5,Y 0,Z 0,A 0,B 0,C 0\n", r"a.src line 1: a brace stays open"),
         ("a.ls", FANUC.replace("-195.800", "-195,800"), r"a.ls line 7: P\[1\] has '-195,800'"),
-        ("a.csv", "a,b\n1,2\n", r"a.csv line 1: no columns x, y, z"),
-        ("a.csv", "x,y,z\n1,2,oops\n", r"a.csv line 2: z is 'oops'"),
-        ("a.csv", "x,y,z,qw,qx,qy,qz\n1,2,3,1,1,0,0\n", r"a.csv line 2: quaternion of length 1.4142"),
-        ("a.csv", "x,y,z,rx,ry,rz\n1,2,3,0,0,1\n", r"a.csv line 1: rx, ry, rz may be degrees or a rotation vector"),
-        ("a.txt", "x", r"unknown kind '.txt'"),
         ("a.ls", "", r"empty"),
     ],
 )  # fmt: skip
