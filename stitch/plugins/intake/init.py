@@ -127,7 +127,6 @@ def _init_from_bag(
     bag: Path, output: Path | None, mount: str | None, topic: str | None, named: str | None, as_json: bool
 ) -> None:
     """Write a session beside a bag if nowhere else; what its messages do not say is not asked, flags state it."""
-    from stitch.plugins.intake.make_session import Made
     from stitch.plugins.intake.ros_bag import write_bag_session
 
     out = output or bag.with_name(f"{bag.stem}-session")
@@ -137,7 +136,7 @@ def _init_from_bag(
     with show_activity("reading the bag"):
         made = write_bag_session(bag, out, topic, frames, mount)
     _print_guesses(made.guesses)
-    _report_session(out, Made(made.views, made.guesses, "run"), as_json)
+    _report_session(out, made, as_json)
 
 
 def _init_from_files(folder: Path, out: Path, options: dict[str, str], yes: bool, force: bool, as_json: bool) -> None:

@@ -22,11 +22,14 @@ from stitch.plugins.intake.convention_choice import choose_convention
 from stitch.plugins.intake.first_session import capture_of
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import ColumnLayout
+from stitch.plugins.intake.make_session import Made
 from stitch.plugins.intake.readings import Reading, arm_link_pairs
 from stitch.plugins.intake.session_guesses import score_words
 from stitch.plugins.intake.stops import AROUND, middle_of_stops, stationary_scans
 from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
+from stitch.session.reading.depth_image import lifted
+from stitch.session.reading.intrinsics import Intrinsics
 from stitch.session.reading.robot_description import moving_joints, robot_from_urdf
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import shortened
@@ -413,26 +416,18 @@ def _without_empty_points(table: Array) -> Array:
     return table[np.isfinite(table[:, :3]).all(axis=1) & table[:, :3].any(axis=1)]
 
 
-def depth_array(message: Any, camera: Any) -> Array:
-    """(H, W, 3) points of a depth image by its CameraInfo, which must be of an image without distortion."""
+def depth_array(message: Any, camera: Any, where: str) -> Array:
+    """Return (H, W, 3) points of a depth image by its CameraInfo, m."""
     order = ">" if message.is_bigendian else "<"
     kind, scale = ("f4", 1.0) if message.encoding == "32FC1" else ("u2", _METRES_PER_MM)
     rows = np.ascontiguousarray(message.data, np.uint8).reshape(message.height, message.step)
     width = message.width * np.dtype(kind).itemsize
     z = np.ascontiguousarray(rows[:, :width]).view(order + kind).astype(float) * scale
-    z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
-    K = camera.k if hasattr(camera, "k") else camera.K  # in ROS 2, in ROS 1
+    K, d = (getattr(camera, name, getattr(camera, name.upper(), ())) for name in "kd")  # in ROS 2, in ROS 1
+    distortion = np.asarray(d, float) if np.any(d) else np.zeros(0)
     fx, cx, fy, cy = (float(K[i]) for i in (0, 2, 4, 5))
-    v, u = np.mgrid[: message.height, : message.width]
-    return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
-
-
-@dataclass(frozen=True)
-class BagSession:
-    """What was made of a bag."""
-
-    views: int
-    guesses: tuple[Guess, ...]
+    lens = Intrinsics(Path(where), fx, fy, cx, cy, distortion, size=None, units_per_metre=None)
+    return lifted(where, z, lens)
 
 
 @dataclass(frozen=True)
@@ -447,7 +442,7 @@ class _ChosenScans:
 
 def write_bag_session(
     bag: Path, out: Path, topic: str | None = None, named: Sequence[str] = (), mount: str | None = None
-) -> BagSession:
+) -> Made:
     """Write a session of a bag into a new folder, whole or not at all; lengths in mm.
 
     Args:
@@ -478,7 +473,7 @@ def write_bag_session(
         guesses = (of_topic, *_frame_guesses(told, T_mount), of_mount, chosen.guess, of_joints)
         toml = _session_toml(bag, of_mount.value, T_mount, robot, guesses)
         (scratch / "session.toml").write_text(toml, encoding="utf-8")
-    return BagSession(len(chosen.times), guesses)
+    return Made(len(chosen.times), guesses, "run")
 
 
 def _mount_guess(bag_frames: BagFrames, stated: str | None, clouds: Sequence[Path], T_base_flange: Array) -> Guess:
@@ -560,7 +555,7 @@ def _write_scans(bag: Path, topic: str, contents: BagContents, chosen: _ChosenSc
             if connection.msgtype == CLOUD:
                 array = cloud_array(message, where)
             else:
-                array = depth_array(message, _camera_info(contents, topic, where))
+                array = depth_array(message, _camera_info(contents, topic, where), where)
             array[..., :3] *= _MM_PER_METRE
             np.save(folder / f"v{chosen.messages[number]:03d}.npy", array.astype(np.float32))
 
@@ -569,10 +564,7 @@ def _camera_info(contents: BagContents, topic: str, where: str) -> Any:
     beside = topic.rsplit("/", 1)[0] + "/camera_info"
     if beside not in contents.cameras:
         raise InputError(f"{where}: a depth image needs {beside}; to fix: record that topic too")
-    camera = contents.cameras[beside]
-    if np.any(camera.d if hasattr(camera, "d") else camera.D):
-        raise InputError(f"{where}: its lens distorts ({beside}); to fix: record the rectified images")
-    return camera
+    return contents.cameras[beside]
 
 
 def _session_toml(bag: Path, mount: str, T_mount: Array | None, robot: dict[str, str], guesses: Sequence[Guess]) -> str:
