@@ -397,15 +397,9 @@ def _from_lists(file: Path, lists: dict[str, tuple[list[PoseRow], str]]) -> list
 
 
 def header_poses(clouds: Sequence[Path]) -> RawPoses:
-    """The pose in the header of each scan, named as its file is, with the time where the header has one.
-
-    Raises:
-        InputError: a header without a pose.
-    """
+    """The pose in the header of each scan, named as its file is, with the time where the header has one."""
     poses = poses_in_scans(list(clouds))
-    if poses is None:
-        named = Fix("name them with --poses FILE", {"poses": "FILE"})
-        raise Refusal(f"{clouds[0].parent}: no poses in the headers of the scans", named)
+    assert poses is not None
     told = times_in_scans(list(clouds))
     times: Sequence[tuple[str, ...]] = [()] * len(clouds) if told is None else [(time,) for time in told]
     words = "they may be the scanner's own, of scans that were registered already: then the hand-eye is about unity"

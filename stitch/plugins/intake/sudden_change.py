@@ -18,6 +18,7 @@ from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.screening.conventions import fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
+from stitch.screening.linkage import Linkage
 from stitch.screening.motions import (
     FEWEST,
     ROTATION,
@@ -27,6 +28,7 @@ from stitch.screening.motions import (
     fit_motions,
     rotation_angles,
 )
+from stitch.screening.placement import place_groups
 from stitch.session.capture import Capture
 
 # Motions of a group, and of all with the change undone, that close: scans of a symmetric part register wrongly now and
@@ -40,6 +42,8 @@ _CHANGE_MM, _CHANGE_RAD = 1.0, 2e-3
 # Two scans lie on each other where half of the points of either, on average, lie within this share of the part's size
 # of the other. Where a point lies nearer to a scanner than what it saw there, by this share, one of both was not there.
 _ON, _NEAR, _BEFORE = 0.5, 0.01, 0.05
+# One part at two places lies on itself, once it is moved back, nearly as its scans do at one place.
+_AS_ONE = 0.93
 # Shares of such points, in the middle of all pairs: between the groups at least, within them at most.
 _BETWEEN, _WITHIN = 0.04, 0.015
 # Points of a scan that are asked, and scans before and behind it in the list that they are held against.
@@ -57,36 +61,96 @@ def require_one_part(clouds: Sequence[Path], capture: Capture, best: ConventionS
     Raises:
         InputError: names the scans of either group.
     """
-    hypothesis = best.interpretation.hypothesis(0)
-    poses, used = hypothesis.T_reference_mount @ best.T_mount, best.interpretation.pairing.used
-    if len(used) < 2 * _FEWEST_VIEWS:
+    poses = best.interpretation.hypothesis(0).T_reference_mount @ best.T_mount
+    groups = _groups_apart(capture, poses, best.interpretation.pairing.used)
+    if groups is None:
         return
+    first, second, share = groups
+    names = [", ".join(clouds[rows[i]].name for i in np.flatnonzero(side).tolist()) for side in (first, second)]
+    told = (
+        f"{names[0]} lie on each other, so do {names[1]}; between the two groups {share:.0%} of the points lie before "
+    )
+    told += "what the other saw"
+    step, apart, within = _step_between(capture, poses, first, second)
+    if apart < _AS_ONE * within:
+        told = f"two parts, or one that changed its shape: {told}; brought as near as one step can, {apart:.0%} of the "
+        told += f"points lie on the other group, {within:.0%} within each"
+    else:
+        shift = ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in step[:3, 3].tolist())
+        turn = np.degrees(np.linalg.norm(frames.log(step[None])[0, :3]))
+        told = f"the part or the base changed its place: {told}, unless moved by ({shift}) mm and {turn:.2f}°"
+    raise Refusal(f"{clouds[0].parent}: {told}", *_one_group_each(clouds, best.interpretation, rows, second))
+
+
+def _groups_apart(capture: Capture, poses: Array, used: Sequence[int]) -> tuple[Mask, Mask, float] | None:
+    """Return two groups of views that contradict each other, and in what share of points; None of one part."""
     pairs = [(v, w) for v in used for w in used if v != w and abs(v - w) <= _NEIGHBOURS]
+    if len(used) < 2 * _FEWEST_VIEWS:
+        return None
     scans = [scan.points for scan in capture.scans]
-    size = float(np.median([np.linalg.norm(np.ptp(points, axis=0)) for points in scans]))
-    trees = [cKDTree(points) for points in scans]
-    sights = [cKDTree(points / np.linalg.norm(points, axis=1, keepdims=True)) for points in scans]
-    on, before = np.zeros((2, len(scans), len(scans)))
-    for v, w in pairs:
-        asked = frames.transform(frames.inverse(poses[w]) @ poses[v], scans[v][:: -(-len(scans[v]) // _ASKED)])
-        on[v, w] = (trees[w].query(asked)[0] < _NEAR * size).mean()
-        away = np.linalg.norm(asked, axis=1)
-        aside, seen = sights[w].query(asked / away[:, None])
-        nearer = np.linalg.norm(scans[w][seen], axis=1) - away > _BEFORE * size
-        before[v, w] = (nearer & (aside * away < _NEAR * size)).mean()
-    group = _linked(len(scans), [(v, w) for v, w in pairs if on[v, w] + on[w, v] >= 2 * _ON])
+    on = _lying_on(capture, poses, pairs)
+    group = _linked(len(scans), [(v, w) for v, w in pairs if on[v, w] >= _ON])
     first, second = (group == k for k in np.argsort(-np.bincount(group, minlength=2))[:2])
     if min(first.sum(), second.sum()) < _FEWEST_VIEWS:
-        return
+        return None
+    sights = [cKDTree(points / np.linalg.norm(points, axis=1, keepdims=True)) for points in scans]
+    before = np.zeros((len(scans), len(scans)))
+    for v, w in pairs:
+        points = _seen_from(capture, poses, v, w)
+        away = np.linalg.norm(points, axis=1)
+        aside, seen = sights[w].query(points / away[:, None])
+        nearer = np.linalg.norm(scans[w][seen], axis=1) - away > _BEFORE * _scan_size(capture)
+        before[v, w] = (nearer & (aside * away < _NEAR * _scan_size(capture))).mean()
     between = [max(before[v, w], before[w, v]) for v, w in pairs if first[v] and second[w]]
     within = [before[v, w] for v, w in pairs if group[v] == group[w]]
-    if between and np.median(between) >= _BETWEEN and np.median(within) <= _WITHIN:
-        names = [", ".join(clouds[rows[i]].name for i in np.flatnonzero(side).tolist()) for side in (first, second)]
-        told = f"{clouds[0].parent}: two parts, or one that changed its shape: {names[0]} lie on each other, so do "
-        told += (
-            f"{names[1]}; between the two groups {np.median(between):.0%} of the points lie before what the other saw"
-        )
-        raise Refusal(told, *_one_group_each(clouds, best.interpretation, rows, second))
+    apart = bool(between) and np.median(between) >= _BETWEEN and np.median(within) <= _WITHIN
+    return (first, second, float(np.median(between))) if apart else None
+
+
+def _lying_on(capture: Capture, poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Return (V, V) of pairs of views the share of points of either that lie on the other, on average."""
+    trees = [cKDTree(scan.points) for scan in capture.scans]
+    near = _NEAR * _scan_size(capture)
+    on = np.zeros((len(poses), len(poses)))
+    for v, w in pairs:
+        on[v, w] = (trees[w].query(_seen_from(capture, poses, v, w))[0] < near).mean()
+    return (on + on.T) / 2
+
+
+def _seen_from(capture: Capture, poses: Array, v: int, w: int) -> Array:
+    """Return some points of the view v in the scanner's frame of the view w."""
+    points = capture.scans[v].points
+    return frames.transform(frames.inverse(poses[w]) @ poses[v], points[:: -(-len(points) // _ASKED)])
+
+
+def _step_between(capture: Capture, poses: Array, first: Mask, second: Mask) -> tuple[Array, float, float]:
+    """Return the one step (4, 4) that brings the second group nearest to the first.
+
+    And what share of the points of one group lie on the other then, and within each, in the middle of all pairs.
+    """
+    parts = tuple(tuple(np.flatnonzero(side).tolist()) for side in (first, second))
+    across = [pair for v in parts[0] for w in parts[1] for pair in ((v, w), (w, v))]
+    centres = np.array(
+        [frames.transform(T, scan.points).mean(axis=0) for T, scan in zip(poses, capture.scans, strict=True)]
+    )
+    inside = [(v, w) for part in parts for v in part for w in part if v != w]
+    on = _lying_on(capture, poses, inside)
+    best = np.eye(4), 0.0
+    for shift in (centres[first].mean(axis=0) - centres[second].mean(axis=0), np.zeros(3)):
+        moved = np.array(poses)
+        moved[second, :3, 3] += shift
+        limits = (_NEAR * _scan_size(capture), _FITS)
+        for placement in [*place_groups(capture, moved, Linkage(len(poses), parts, ()), limits).values()][:1]:
+            step = placement.T @ frames.inverse(poses[parts[1][0]])
+            moved[second] = step @ poses[second]
+            lying = _lying_on(capture, moved, across)
+            best = max(best, (step, float(np.median([lying[pair] for pair in across]))), key=lambda one: one[1])
+    return *best, float(np.median([on[pair] for pair in inside]))
+
+
+def _scan_size(capture: Capture) -> float:
+    """The diagonal of the box of a scan, in the middle of all."""
+    return float(np.median([np.linalg.norm(np.ptp(scan.points, axis=0)) for scan in capture.scans]))
 
 
 def require_no_change(
