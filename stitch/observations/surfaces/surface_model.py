@@ -27,7 +27,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
     reduce_poses,
 )
 from stitch.observations.surfaces.normal_equations import pair_squares
-from stitch.observations.surfaces.scanner_errors import field_scatter
+from stitch.observations.surfaces.scanner_errors import field_scatter, scale_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
@@ -196,7 +196,11 @@ def surface_model(
 
     twists = view_columns(measurement, model, unconstrained)
     sizes, values = sizes_of(model.terms), values_of(model.terms)
-    field = reduced.reduction @ field_scatter(measurement, unconstrained)
+    known = [field_scatter(measurement, unconstrained)]
+    if measurement.views.scanners:
+        # What one scanner's millimetre differs by from another's shows, and every pair has it.
+        known.append(scale_scatter(measurement, unconstrained))
+    field = reduced.reduction @ np.hstack(known)
     alone = replace(hand_eye_mixed_model(reduced), fixed=(field @ field.T)[None])
     half = np.linalg.cholesky(alone.covariance(fit_null(alone).variances)[0])
     base = np.linalg.solve(half, reduced.hand_eye).astype(float)
