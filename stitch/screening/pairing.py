@@ -77,7 +77,10 @@ def explain_misplaced(
     for step in snooping.steps:
         side = range(step.start) if step.start <= snooping.largest_segment.start else range(step.start, len(names))
         explain("moved", side, **_between(side, step.moved if step.distinguishable else "either", names))
-    if len(snooping.disconnected) > 1:
+    if snooping.alone:
+        for v in snooping.alone:
+            explain("alone", [v])
+    elif len(snooping.disconnected) > 1:
         shown = " | ".join(list_views([names[v] for v in group], names) for group in snooping.disconnected)
         explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=shown)
     return out

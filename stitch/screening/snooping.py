@@ -88,6 +88,16 @@ class Snooping:
         return max((range(a, b) for a, b in pairwise(ends)), key=len)
 
     @property
+    def alone(self) -> tuple[int, ...]:
+        """Single views that no surface links to the others, which are most; none where groups stand apart."""
+        if not self.disconnected:
+            return ()
+        most, *others = self.disconnected
+        if any(len(group) > 1 for group in others) or 2 * len(most) <= self.linkage.views:
+            return ()
+        return tuple(v for group in others for v in group)
+
+    @property
     def not_belonging(self) -> set[int]:
         """Views that are misplaced or not linked."""
         return {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}

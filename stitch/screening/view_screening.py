@@ -222,7 +222,7 @@ def _misplaced_views(
 ) -> tuple[ExcludedView, ...]:
     problems = explain_misplaced(session, capture, T_mount, snooping) if snooping.left_out else []
     disconnected = next((found for found in problems if found.kind == "disconnected"), None)
-    if disconnected is not None:
+    if disconnected is not None and not snooping.alone:
         raise NoResultError(f"{session.path}: {disconnected.line(session.names)}")
     poses = capture.poses(T_mount)
     why = {name: found.line(session.names) for found in reversed(problems) for name in found.views}

@@ -36,6 +36,19 @@ def test_a_good_session_loses_no_view(cell):
     assert 0.01 < found.translation < 0.04 and 1e-5 < found.rotation < 4e-5
 
 
+def test_views_that_most_others_do_not_meet_stand_alone_and_groups_do_not(cell):
+    measured, own = cell
+    found = snoop_views(own, measured.T_mount, GATE)
+
+    def alone(*groups):
+        return replace(found, disconnected=groups).alone
+
+    assert found.alone == ()
+    assert alone(tuple(range(10)), (10,), (11,)) == (10, 11)
+    assert alone(tuple(range(9)), (9, 10), (11,)) == ()
+    assert alone((0, 1, 2), *((v,) for v in range(3, 12))) == ()
+
+
 @pytest.mark.parametrize("shift", [1.0, 40.0])
 def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
     measured, own = cell
