@@ -26,6 +26,8 @@ from data_synth.write import write_session
 from stitch.fusion.register import METHODS, register
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.observations.surfaces.hand_eye_fit import capture_repeatability
+from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.output.stored_run import load_run
 from stitch.run_data import RunData
 
@@ -111,11 +113,12 @@ def _poses(run: RunData, measured: Measured, view: int, sigma: list[float] | Non
     true = measured.T_reference_scanner[kept]
     capture = run.measurement.capture
     raw = captured(measured).without(np.setdiff1d(np.arange(VIEWS), kept))
+    scatter = capture_repeatability(capture, unconstrained_poses(capture, run.poses_model, run.gate), run.T_mount)
     middle = frames.transform(run.poses[own], capture.scans[own].points.mean(axis=0)[None])[0]
     row: Row = {} if sigma is None else {"pose_sigmas": (_error(middle, run.poses, true, own) / sigma).tolist()}
     for name, method in METHODS.items():
         for scans, of_scans in zip(_SCANS, (raw, capture), strict=True):
-            poses = register(of_scans, run.poses_model, run.repeatability, run.gate, method=method).poses
+            poses = register(of_scans, run.poses_model, scatter, run.gate, method=method).poses
             row[f"{name}, {scans}"] = 1e3 * float(np.linalg.norm(_error(middle, poses, true, own)[3:]))
     return row
 

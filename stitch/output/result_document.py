@@ -21,7 +21,8 @@ from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.scanner_places import ScannerAlone
-from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.hand_eye_fit import Repeatability, capture_repeatability
+from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.outliers import Outlier, mask_outliers
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output.comparison.model_history import model_history
@@ -302,6 +303,10 @@ def _all_views(run: RunData) -> list[ViewRow]:
     return [rows[place] for place in sorted(rows)]
 
 
+def _has_stock(run: RunData) -> bool:
+    return any(scan.stock is not None for scan in run.measurement.capture.scans)
+
+
 def _stock_rows(run: RunData) -> list[StockRow]:
     """Return the stock that was taken off the scans."""
     scans = zip(run.session.names, run.measurement.capture.scans, strict=False)
@@ -313,9 +318,13 @@ def _pose_sigma(run: RunData, name: str) -> Array:
     """Return the sigmas (6,) of the pose of a view, beside the mean of the others."""
     assert run.registered is not None
     capture, count, view = run.measurement.capture, len(run.poses), run.session.names.index(name)
-    covariance = pose_covariance(
-        run.registered, capture, run.poses, run.T_mount, run.repeatability, method_named(run.register_method)
-    )
+    scatter = run.repeatability
+    if not np.isfinite(scatter.noise_factor):
+        # A run that was read again does not know it.
+        unconstrained = unconstrained_poses(capture, run.poses_model, run.gate)
+        scatter = capture_repeatability(capture, unconstrained, run.T_mount)
+    method = method_named(run.register_method)
+    covariance = pose_covariance(run.registered, capture, run.poses, run.T_mount, scatter, method)
     middle = frames.transform(run.poses[view], capture.scans[view].points.mean(axis=0)[None])[0]
     against = np.where(np.arange(count) == view, 1.0, -1 / (count - 1))
     moved = np.kron(against, frames.adjoint(frames.make(np.eye(3), run.registered.gram.centre - middle)))
@@ -552,7 +561,7 @@ RESULT = Document(
     Key("axes", write=_axis_rows, when=attrgetter("session.axes")),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
-    Key("stock", _STOCK.rows(), write=_stock_rows, when=_stock_rows),
+    Key("stock", _STOCK.rows(), write=_stock_rows, when=_has_stock),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
     Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
