@@ -33,6 +33,7 @@ from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from stitch.diagnosis.diagnosis import Proposal
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.model.axis_places import AxisPlace
+from stitch.observations.scanner_places import ScannerAlone, ScannerPlace
 from stitch.observations.targets.outliers import Outlier
 from stitch.output.json_file import to_json
 from stitch.plugins.metrology.planning.plan import Plan
@@ -381,6 +382,7 @@ def values(tmp_path_factory):
         *(Outlier(0, "a", 1.0, 2.0), Change(0, 1, 2, "step", None, 1.0, 0.1, 0.01, "mean")),
         Plan(session, (), None, None, (), None),
         AxisPlace("turn", "rotary", np.eye(3)[2], np.zeros(3), np.zeros(3), np.zeros(3)),
+        ScannerPlace("left", np.eye(4), np.eye(6), 0.1, ScannerAlone("left", np.eye(4), np.eye(6))),
         stitch.add(run, "range_scale").model,
         TimeCurve(**{f.name: np.arange(3.0) if "Array" in str(f.type) else 1.0 for f in fields(TimeCurve)}),
     ]

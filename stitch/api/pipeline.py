@@ -45,7 +45,7 @@ from stitch.screening.model_transfer import check_arm_transfer, check_model_tran
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
 from stitch.session.axis_poses import axis_tables
 from stitch.session.capture import Capture, part_size, prepare_capture
-from stitch.session.measurement import Measurement, measurement_of, with_part_origin
+from stitch.session.measurement import Measurement, measurement_of, require_rising_times, with_part_origin
 from stitch.session.notes import session_notes
 from stitch.session.scanners import join_sessions
 from stitch.session.session import SessionData
@@ -101,6 +101,8 @@ def run_rig(
     """
     method_named(register)
     require_same_rig(sessions, model)
+    for session in sessions:
+        require_rising_times(session)
     if model:
         sessions = [with_model_axes(session, model) for session in sessions]
     recorders = recorders or [SilentRecorder() for _ in sessions]

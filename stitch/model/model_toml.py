@@ -238,7 +238,8 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
     for name, parameters in effects.items():
         for p in parameters.values():
             if not np.isfinite(p.value) or p.sigma < 0 or np.isinf(p.sigma):
-                number = f"effects.{name}.{p.name} is {p.value:g} with sigma {p.sigma:g}"
+                sigma = f" with sigma {p.sigma:g}" if np.isfinite(p.value) else ""
+                number = f"effects.{name}.{p.name} is {p.value:g}{sigma}"
                 raise InputError(f"{path}: {number}; to fix: copy that of the run")
     return effects
 

@@ -332,12 +332,20 @@ def intensity_scale(session: SessionData) -> tuple[float, float] | None:
     return float(values.mean()), float(values.std())
 
 
-def views_of(session: SessionData) -> Views:
-    """Collect what effects may know; joints count only where the robot's kinematics are known too.
+def require_rising_times(session: SessionData) -> None:
+    """Refuse views whose times fall: a folder's are when it is read, a program may have changed those of a session.
 
     Raises:
         InputError: times fall from view to view.
     """
+    time = np.array([np.nan if view.time_s is None else view.time_s for view in session.views])
+    if (falls := np.flatnonzero(time < np.fmax.accumulate(time))).size:
+        name = session.views[falls[0]].name
+        raise InputError(f"{session.name}: time_s of view {name} falls; to fix: sort the views by time")
+
+
+def views_of(session: SessionData) -> Views:
+    """Collect what effects may know; joints count only where the robot's kinematics are known too."""
     views = session.views
     axes = axes_of(session)
     scanners = scanners_of(session)
@@ -346,8 +354,6 @@ def views_of(session: SessionData) -> Views:
     joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
     approach = np.array([view.approach for view in views]) if has_joints else np.zeros((count, 0))
     time = np.array([np.nan if view.time_s is None else view.time_s for view in views])
-    if (falls := np.flatnonzero(time < np.fmax.accumulate(time))).size:
-        raise InputError(f"{session.name}: time_s of view {views[falls[0]].name} falls; to fix: sort the views by time")
     # A column with a gap does not count.
     complete = set.intersection(*(set(view.covariates) for view in views))
     covariates = {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}

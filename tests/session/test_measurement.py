@@ -9,7 +9,7 @@ from data_synth.fixtures.labelled_arm import flange, labelled_cell
 from stitch.api.check import session_summary
 from stitch.api.pipeline import run
 from stitch.errors import InputError
-from stitch.session.measurement import views_of
+from stitch.session.measurement import require_rising_times, views_of
 from stitch.session.notes import gaps_note, payload_note
 from stitch.session.torques import torques_of
 
@@ -143,4 +143,4 @@ def test_times_that_fall_are_refused_by_the_view():
     times = (5.0, 6.0, None, 5.5, 7.0, 8.0)
     views = tuple(replace(view, time_s=t) for view, t in zip(session.views, times, strict=True))
     with pytest.raises(InputError, match=f"time_s of view {views[3].name} falls"):
-        views_of(replace(session, views=views))
+        require_rising_times(replace(session, views=views))
