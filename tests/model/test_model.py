@@ -234,7 +234,5 @@ def test_a_number_of_an_effect_that_cannot_be_is_refused_in_a_line(tmp_path, val
     table = f'\n[effects.joint_offset.o1]\nvalue = {value}\nsigma = {sigma}\nunit = "rad"\n'
     text = file.read_text("utf-8").replace("\n[effects]\n", "\n")
     file.write_text(text + table, "utf-8")
-    with pytest.raises(
-        InputError, match=r"effects\.joint_offset\.o1 is .*; to fix: copy that of the run"
-    ):
+    with pytest.raises(InputError, match=r"effects\.joint_offset\.o1 is .*; to fix: copy that of the run"):
         read_model(file)
