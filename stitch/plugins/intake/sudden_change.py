@@ -204,9 +204,10 @@ def _groups(fit: MotionFit, motions: RelativeScans) -> Iterator[Mask]:
         closing = RelativeScans(tuple(p for p, c in zip(motions.pairs, closes, strict=True) if c), motions.T[closes])
         X = fit_motions(fit.hypothesis, closing, TRANSLATION_M / MM).T_mount
     group = _linked(count, zip(v[closes], w[closes], strict=True))
-    largest = np.bincount(group).argmax()
-    if _FEWEST_VIEWS <= (group != largest).sum() <= count - _FEWEST_VIEWS:
-        yield group != largest
+    other = group != np.bincount(group).argmax()
+    if _FEWEST_VIEWS <= other.sum() <= count - _FEWEST_VIEWS:
+        # The first few and no others: what changed, changed at the view behind them.
+        yield other != other[0] if (np.diff(other.astype(int)) <= 0).all() else other
 
 
 def _linked(count: int, links: Iterable[tuple[int, int]]) -> Indices:

@@ -9,13 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.plugins.intake import sudden_change
 from stitch.plugins.intake.cloud_pairs import Pairing
 from stitch.plugins.intake.convention_choice import Interpretation
-from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.layouts import MM, possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import readings
 from stitch.plugins.intake.sudden_change import require_no_change
-from stitch.screening.motions import RelativeScans
+from stitch.screening.motions import TRANSLATION_M, RelativeScans, fit_motions
 
 X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array([62.0, -38.0, 95.0]))
 CLOUDS = [Path(f"cell/scan_{i:02d}.ply") for i in range(10)]
@@ -58,6 +59,14 @@ def test_a_change_is_named_with_its_view_and_its_size(side):
     with pytest.raises(InputError, match="changed at scan_05.ply") as refused:
         require_no_change(CLOUDS, *campaign(**{side: change}), range(10))
     assert "150.0) mm and 0.00°" in str(refused.value) and "100% of the scanner's motions close" in str(refused.value)
+
+
+def test_of_the_first_few_views_the_others_changed():
+    """Which half is smaller is chance: what is named is the view at which it changed."""
+    motions, ways = campaign(base=frames.make(np.eye(3), np.array([0.0, 30.0, 150.0])), views=slice(0, 4))
+    fit = fit_motions(ways[0].hypothesis(0), motions, TRANSLATION_M / MM)
+    halves = [later for later in sudden_change._groups(fit, motions) if later[:4].all() != later[4:].all()]
+    assert halves and not any(later[0] for later in halves)
 
 
 @pytest.mark.parametrize(
