@@ -158,4 +158,4 @@ def summary(rows: list[Row]) -> list[str]:
     return out + markdown("pose error of the view, rms / µm | from scans as they came | stock taken off", by_method)
 
 
-TABLE = Table(jobs, trial, summary, range(6700, 6740), "register", "stock")
+TABLE = Table(jobs, trial, summary, range(6800, 6840), "register", "stock")
