@@ -39,8 +39,7 @@ class FirstRun:
         try:
             return json_response(await asyncio.to_thread(self._session, options))
         except Refusal as refused:
-            fixes = [fix.as_dict(self.folder) | {"shows": fix.shows} for fix in refused.fixes]
-            return json_response({"refused": refused.what, "fixes": fixes})
+            return json_response(refused.as_dict(self.folder))
         except StitchError as error:
             return refusal_response(error)
 
@@ -59,5 +58,4 @@ class FirstRun:
             return {"guesses": [], "not_used": []}
         made = make_session(self.folder, self.folder, options, guess=True, force=self.wrote)
         self.wrote = True
-        guesses = [guess.as_dict() | {"question": guess.question()} for guess in made.guesses]
-        return {"views": made.views, "guesses": guesses, "not_used": made.not_used}
+        return {"views": made.views} | made.as_dict()

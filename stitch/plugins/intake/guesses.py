@@ -56,6 +56,7 @@ class Guess:
             "runner_up": self.runner_up,
             "because": self.because,
             "against": [{"what": self.runner_up, "worse_by": self.worse_by}] if self.runner_up else [],
+            "question": self.question(),
         }
 
     def question(self) -> dict[str, Any]:

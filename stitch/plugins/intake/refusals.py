@@ -36,6 +36,7 @@ class Fix:
             "file": str(self.file) if self.file else None,
             "command": self.command(folder),
             "python": self.python(folder),
+            "shows": list(self.shows),
         }
 
 
