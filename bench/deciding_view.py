@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.drawn_cells import scene_of
 from bench.harness import Row, Table, grouped, markdown, share, with_all
-from bench.small_cells import scene_of
 from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for

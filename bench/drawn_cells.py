@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from bench.small_cells import scene_of
 from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
@@ -17,7 +16,7 @@ from data_synth.nature import Nature
 from data_synth.ordinary_arm import OrdinaryArm
 from data_synth.scanner import Cloud
 from data_synth.scene import Scene, load_scene
-from data_synth.simulate import moments_of, on_rail, simulate
+from data_synth.simulate import Measured, moments_of, on_rail, simulate
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.fit.correct import COARSE_SAMPLES
 from stitch.model.model import Model
@@ -30,9 +29,12 @@ from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps, gram, next_gate, robust_scale
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses, visible_step
+from stitch.run_data import RunData
 from stitch.session.capture import part_size, prepare_capture
 from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 
+SCENES = ("blade", "drill-plate", "blade-table")
+_PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80, "spheres": 80}
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm
 # First distance between partners, as a share of the part: poses scatter by far less.
 GATE = 0.05
@@ -83,6 +85,18 @@ class World:
     joint_errors: Array | float = 0.0  # (V, n) rad
     flange_errors: Array | float = 0.0  # (V, 6) rad, mm, in the flange's frame
     scatter: Array | float = 1.0  # (V, 6) in units of 20 µm and 20 µrad; 1.0: independent from view to view
+
+
+def scene_of(name: str) -> Scene:
+    """Return a scene with small clouds: evidence counts in views, a few thousand points show what millions would."""
+    scene = load_scene(name)
+    return replace(scene, scanner=replace(scene.scanner, columns=_PIXELS[name], rows=_PIXELS[name]))
+
+
+def hand_eye_chi_square(measured: Measured, state: RunData) -> float:
+    """Return the error of the hand-eye against its covariance; 6 on the average where that is right."""
+    xi = frames.log(frames.inverse(state.T_mount) @ measured.T_mount)
+    return float(xi @ np.linalg.solve(state.mount_covariance, xi))
 
 
 @lru_cache(maxsize=16)

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.drawn_cells import SCENES, hand_eye_chi_square, scene_of
 from bench.harness import Row, Table, grouped, markdown, share, with_all
-from bench.small_cells import SCENES, hand_eye_chi_square, scene_of
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.moment import Plan

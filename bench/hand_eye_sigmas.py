@@ -9,42 +9,32 @@ FEW_VIEWS: whole fits from a coarse hand-eye. Every cell has views, clouds and a
 views and kinds of arm in turn. The scans are those of an arm without errors, and the reported poses those of one that
 has them, which is the same to first order. Used up: 7000, 7100, 9000 to 9026, 31000 to 31044, 31100 to 31123, 40000 to
 40399.
-
-REAL_SCANS: do hand-eyes of one rig agree (folder `reghec` of the shared data), and how far is that of a synthetic blade
-off at the part?
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
-from bench.drawn_cells import GATE, SCATTER, Cell, cell_of, shown
-from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown
-from bench.small_cells import SCENES, scene_of
+from bench.drawn_cells import GATE, SCATTER, SCENES, Cell, cell_of, scene_of, shown
+from bench.harness import Row, Table, grouped, markdown
 from data_synth import kinematics
-from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.ordinary_arm import coupled, draw_arm, with_memory
 from data_synth.scene import load_scene
 from data_synth.simulate import on_rail, simulate
-from stitch.api.pipeline import run, run_rig
 from stitch.fit.correct import correct
 from stitch.model.model import COVERAGE_FACTOR, Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
-from stitch.observations.surfaces.matching import sample_points
-from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.run_data import RunData
 from stitch.session.capture import part_size, prepare_capture
 from stitch.session.measurement import measurement_of
-from stitch.session.reading.session_folder import load_session
 
 KINDS = (
     *(("clean", 0.0), ("ordinary arm", 0.1), ("ordinary arm", 0.3), ("ordinary arm", 1.0), ("ordinary arm", 2.0)),
@@ -57,9 +47,6 @@ VIEWS = (4, 5, 6, 7, 8)
 SIZES = (0.0, 0.5, 1.0)  # of an ordinary arm; 0: nothing but scatter and the quiet effects that every cell has
 _MEDIAN, _BEYOND = 0.891, 2.8  # of χ²(6)/6: its median, its 1 % point
 _NORMAL = 1.96  # 95 % of a normal number
-IN_HAND = ("david", "cone", "sphere", "rubik")
-OBJECTS = (*IN_HAND, "gripperopen")
-BOTH_MOUNTS = ("eye_to_hand", "eye_in_hand")
 
 
 def arm_jobs(seeds: range, draws: int, alone: bool) -> Iterator[Row]:
@@ -172,129 +159,3 @@ def few_summary(rows: list[Row]) -> list[str]:
 
 
 FEW_VIEWS = Table(few_jobs, few_trial, few_summary, range(40_000, 40_400), page="method", block="few")
-
-
-def scan_jobs(seeds: range) -> Iterator[Row]:
-    """Objects alone, together, in pairs and one after david; a blade for each seed and mount."""
-    yield from ({"part": "objects", "object": name} for name in OBJECTS)
-    for i, name in enumerate(IN_HAND):
-        yield from ({"part": "pairs", "pair": [other, name]} for other in IN_HAND[:i])
-    yield {"part": "together"}
-    yield from ({"part": "repeated", "object": name} for name in IN_HAND[1:])
-    for mount in BOTH_MOUNTS:
-        yield from ({"part": "blade", "mount": mount, "seed": seed} for seed in seeds)
-
-
-@cache
-def _run_of(name: str) -> RunData:
-    return run(load_session(SHARED_DATA / "reghec" / name))
-
-
-def _object(job: Row) -> Row:
-    """Rms of one hand-eye, held out, after register; noise, µm; seconds of all stages."""
-    state = _run_of(job["object"])
-    lengths = [1e3 * x for x in (state.residual_rms, state.heldout_rms, state.stages[2].rms, state.noise_floor)]
-    return {"lengths": lengths, "seconds": sum(stage.seconds for stage in state.stages)}
-
-
-def _pair(job: Row) -> Row:
-    """χ² of the difference of two hand-eyes of one rig."""
-    one, other = (_run_of(name) for name in job["pair"])
-    xi = frames.log(frames.inverse(other.T_mount) @ one.T_mount)
-    return {"chi2": float(xi @ np.linalg.solve(other.mount_covariance + one.mount_covariance, xi))}
-
-
-def _together(job: Row) -> Row:
-    """All four sessions in one fit."""
-    joint = run_rig([load_session(SHARED_DATA / "reghec" / name) for name in IN_HAND])
-    sigma = np.sqrt(np.diag(joint[0].mount_covariance))[3:]
-    best = min(np.sqrt(np.trace(_run_of(name).mount_covariance[3:, 3:])) for name in IN_HAND)
-    registered = {name: 1e3 * r.stages[2].rms for name, r in zip(IN_HAND, joint, strict=True)}
-    return {"sigma": float(np.linalg.norm(sigma)), "best": float(best), "registered": registered}
-
-
-def _repeated(job: Row) -> Row:
-    """Rms of an object before and after corrections of david's views, µm."""
-    david = _run_of("david")
-    capture = prepare_capture(load_session(SHARED_DATA / "reghec" / job["object"]))
-    model = capture.poses(david.T_mount)
-    samples = [sample_points(scan, 3000) for scan in capture.scans]
-    poses = (model, frames.exp(david.corrections) @ model)
-    before, after = (1e3 * float(collect_overlaps(capture, T, 4.0, samples).gram.rms) for T in poses)
-    return {"before": before, "after": after}
-
-
-def _blade(job: Row) -> Row:
-    """Squared error and predicted variance of the hand-eye at the part, mean squared z."""
-    scene = load_scene(SCENE_OF_MOUNT[job["mount"]])
-    measured = simulate(replace(scene, small=0.0), {}, job["seed"], 12)
-    capture = captured(measured)
-    start = disturbed(measured.T_mount, 1000 + job["seed"])
-    fit = correct([capture], start, 0.35 * part_size([capture])).hand_eye
-    xi = frames.log(frames.inverse(measured.T_mount) @ fit.T_mount)
-    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
-    J = np.hstack([-frames.skew(middle), np.eye(3)])
-    z = xi / np.sqrt(np.diag(fit.covariance))
-    return {
-        "error": float(np.sum((J @ xi) ** 2)),
-        "predicted": float(np.trace(J @ fit.covariance @ J.T)),
-        "z": float(np.mean(z**2)),
-    }
-
-
-def _objects_table(rows: list[Row]) -> list[str]:
-    lines = ([row["object"], *(f"{x:.0f}" for x in row["lengths"]), f"{row['seconds']:.1f}"] for row in rows)
-    head = "object | one hand-eye, rms (µm) | held-out (µm) | after register (µm) | sensor noise (µm) | seconds"
-    title = "## Real scans, no hand-eye given (RegHEC: 5 objects, 9 views each)"
-    return [title, "", *markdown(head, lines)]
-
-
-def _pairs_table(rows: list[Row]) -> list[str]:
-    return [
-        "## The four eye-in-hand objects come from one rig: do their hand-eyes agree?",
-        "",
-        "Difference squared over the sum of covariances, 6 degrees of freedom; 17.3 is the 95 % limit for six pairs.",
-        "",
-        *markdown("pair | χ²", ([", ".join(row["pair"]), f"{row['chi2']:.1f}"] for row in rows)),
-    ]
-
-
-def _together_sentence(rows: list[Row]) -> list[str]:
-    [row] = rows
-    registered = ", ".join(f"{name} {rms:.0f} µm" for name, rms in row["registered"].items())
-    return [
-        f"Together: one hand-eye, translation sigma {row['sigma']:.2f} mm (best single object {row['best']:.2f} mm); "
-        f"after register {registered}."
-    ]
-
-
-def _repeated_table(rows: list[Row]) -> list[str]:
-    lines = ([row["object"], f"{row['before']:.0f}", f"{row['after']:.0f}"] for row in rows)
-    title = "## Pose errors repeat: corrections learned on david, applied to the same poses before other objects"
-    return [title, "", *markdown("object | before (µm) | after (µm)", lines)]
-
-
-def _blade_table(rows: list[Row]) -> list[str]:
-    lines = []
-    for mount, group in grouped(rows, "mount").items():
-        error, predicted, z = (np.sqrt(np.mean([row[key] for row in group])) for key in ("error", "predicted", "z"))
-        lines.append([mount, f"{1e3 * error:.1f}", f"{1e3 * predicted:.1f}", f"{error / predicted:.2f}", f"{z:.2f}"])
-    return [
-        f"## Synthetic blade, 12 views, {len(group)} seeds, start off by 5° and 30 mm",
-        "",
-        "Repeatability put in: 20 µm and 20 µrad. z: error over sigma, all six components.",
-        "",
-        *markdown("mount | rms error at the part (µm) | predicted (µm) | ratio | rms z", lines),
-    ]
-
-
-PARTS = Parts(
-    {
-        "objects": (_object, _objects_table),
-        "pairs": (_pair, _pairs_table),
-        "together": (_together, _together_sentence),
-        "repeated": (_repeated, _repeated_table),
-        "blade": (_blade, _blade_table),
-    }
-)
-REAL_SCANS = Table(scan_jobs, PARTS.trial, PARTS.summary, range(20), page="results", block="scans", one_core=False)

@@ -1,31 +1,23 @@
-"""Do what is said of measured features and of planned views hold?
+"""Does U of features hold, on sphere plates in cells of known truth?
 
-FEATURES: does U of features hold, on sphere plates in cells of known truth? A clean cell; a compliance of the joints
-that is in the model; an arm that is a little wrong in every joint and link; a scanner with smooth errors over field and
-incidence, each half as large as its noise; one whose smooth errors are new in each scan. All have the small errors that
-every simulated cell has. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000 to 30003,
-40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019.
-
-CHANCES: do the chances that `stitch plan` states hold? A cell with one hidden effect of the size that nature draws,
-times 0.2 to 2. Before any scan the plan says how likely an effect of that size and shape is detected, named, misnamed;
-then every scan is simulated, and the verdict of a diagnosis taken. The simulator shares no code with the plan. Some 4 s
-a cell; seeds count cells.
+FEATURES: a clean cell; a compliance of the joints that is in the model; an arm that is a little wrong in every joint
+and link; a scanner with smooth errors over field and incidence, each half as large as its noise; one whose smooth
+errors are new in each scan. All have the small errors that every simulated cell has. MONTE_CARLO puts its spread over
+that of propagation. Used up: 20000 to 20223, 30000 to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to
+46019.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
-from itertools import pairwise
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
 import trimesh
 from scipy.stats import beta
 
-from bench.harness import Row, Table, markdown, share
-from bench.unknown_laws import nearest_form
+from bench.harness import Row, Table, markdown
 from data_synth import kinematics
-from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.ordinary_arm import draw_arm
@@ -33,24 +25,13 @@ from data_synth.scene import load_scene
 from data_synth.shapes.spheres import SpherePlate, build_plate, centres
 from data_synth.simulate import Measured, simulate
 from stitch.api.pipeline import run
-from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.evidence import gather_evidence
-from stitch.diagnosis.score import scatter_limit
-from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.observations.pose_errors import prior_pose_errors
-from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
-from stitch.observations.surfaces.surface_model import surface_model
-from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.plugins.metrology.budget import measure_features, monte_carlo
 from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList
 from stitch.plugins.metrology.features import Feature
 from stitch.plugins.metrology.place_errors import PlaceErrors
-from stitch.plugins.metrology.planning import expected_model as expected
-from stitch.plugins.metrology.planning.detection_chances import DRAWS, ExpectedDiagnosis
-from stitch.session.measurement import measurement_of, with_part_origin
 
 NEW_IN_EACH = "smooth errors new in each scan"
 ARM_AND_NEW = f"ordinary arm, {NEW_IN_EACH}"
@@ -72,15 +53,6 @@ ARM = 0.3  # of an ordinary arm, in plausible sizes
 FIELD = 0.01  # of a scanner with smooth errors, mm rms
 SCAN_LENGTHS = (0.05, 0.3)  # over which those of a single scan stay alike, as shares of the field
 REPEATABILITY = (15e-6, 0.01)  # of the flange, rad and mm
-LAWS = (
-    *("joint_compliance", "range_scale", "gear_harmonic", "backlash", "part_slip", "joint_offset", "incidence_bias"),
-    *("link_geometry", "mount_drift", "gear_eccentricity", "lens_distortion", "settling"),
-)
-FIRST_SEED = 700
-_VIEWS, _PIXELS = 12, 150
-_SIZES = (0.2, 2.0)  # of nature's own, log-uniform
-_BINS = (0.0, 0.25, 0.75, 1.0)
-_ENOUGH = 20
 
 
 def feature_jobs(seeds: range) -> Iterator[Row]:
@@ -222,95 +194,3 @@ MONTE_CARLO = Table(
     trials_jobs, trials_trial, trials_summary, range(40_200, 40_204), page="measure", block="monte-carlo",
     settings={"trials": 4000},
 )  # fmt: skip
-
-
-def chance_jobs(seeds: range) -> Iterator[Row]:
-    """Every third cell has nothing hidden, mounts take turns."""
-    for index in seeds:
-        law = None if index % 3 == 2 else LAWS[(index - index // 3) % len(LAWS)]
-        yield {"index": index, "law": law, "mount": ("eye_to_hand", "eye_in_hand")[index // 3 % 2]}
-
-
-def chance_trial(job: Row) -> Row:
-    """What the plan says before any scan, and what a diagnosis says of the scans."""
-    rng = np.random.default_rng([FIRST_SEED, job["index"]])
-    law, size = job["law"], float(np.exp(rng.uniform(*np.log(_SIZES))))
-    cell = partial(measured_blade, FIRST_SEED + job["index"], views=_VIEWS, mount=job["mount"], pixels=_PIXELS)
-    measured = cell(hidden={} if law is None else {law: size})
-    predicted = planned(measured, law, rng)
-    return {"size": size, **predicted, **diagnosed(measured, predicted)}
-
-
-def planned(measured: Measured, law: str | None, rng: np.random.Generator) -> Row:
-    """Return what the plan says: it knows the part, the poses, the coarse hand-eye and the usual scatter."""
-    session, scene = session_of(measured), measured.scene
-    half = np.tan(np.radians(scene.scanner.field_of_view / 2)) * np.ones(2)
-    reach, axis = scene.scanner.standoff, np.array([0.0, 0.0, 1.0])
-    field = expected.FieldOfView(half, 0.7 * reach, 1.3 * reach, standoff=reach, axis=axis)
-    part = expected.surface_of_mesh(measured.mesh.copy()).moved(scene.T_reference_part)
-    cell = expected.CellModel(Model(measured.T_coarse), part, field, expected.stated_scatter(session))
-    views = expected.simulate_views(session, cell)
-    linear = expected.expected_model(views, cell)
-    scatter = expected.expected_scatter(linear, cell.scatter.noise)
-    hand_eye = expected.expected_hand_eye(expected.with_scatter(linear, scatter.believed), views)
-    predicted: Row = {"covariance": hand_eye.covariance.tolist()}
-    if law is None:
-        return predicted
-    candidates, _ = candidates_of(linear, empirical=False)
-    candidate = next(c for c in candidates if c.name == law)
-    true = measured.hidden[law]
-    form = nearest_form(candidate, true)
-    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
-    shift = np.repeat((form.columns @ values[form.keep])[:, None], DRAWS, axis=1)
-    fitted = expected.with_scatter(linear, scatter.fitted)
-    chance = ExpectedDiagnosis(fitted, candidates).chance(law, shift, rng)
-    return predicted | {"detected": chance.detected, "named": chance.named, "misnamed": chance.misnamed}
-
-
-def diagnosed(measured: Measured, predicted: Row) -> Row:
-    """Return the verdict about the simulated scans; of a cell with nothing hidden, the error of the hand-eye too."""
-    session, capture = session_of(measured), captured(measured)
-    measurement = with_part_origin(measurement_of(session, capture), measured.T_mount)
-    views = unconstrained_poses(capture, capture.poses(measured.T_mount), 4 * capture.spacing)
-    model = Model(measured.T_mount)
-    linear = surface_model(measurement, model, capture, views)
-    evidence = gather_evidence(linear, candidates_of(linear)[0], scatter_limit(session))
-    row: Row = {"verdict": evidence.verdict, "said": [r.name for r in evidence.named]}
-    if not measured.hidden:
-        errors = prior_pose_errors([measurement], model, [views.overlaps.gram.centre])
-        T_mount = fit_hand_eye([capture], [views], measured.T_mount, errors=errors).T_mount
-        xi = frames.log(frames.inverse(measured.T_mount) @ T_mount)
-        row["chi_square"] = float(xi @ np.linalg.solve(np.array(predicted["covariance"]), xi))
-    return row
-
-
-def chance_summary(rows: list[Row]) -> list[str]:
-    """What was predicted against what came, in bins of the predicted chance."""
-    hidden = [row for row in rows if row["law"] is not None]
-    empty = [row for row in rows if row["law"] is None]
-    came: dict[str, Callable[[Row], bool]] = {
-        "detected": lambda r: r["verdict"] != "adequate",
-        "named": lambda r: r["verdict"] == "missing_effect" and r["said"] == [r["law"]],
-        "misnamed": lambda r: r["verdict"] == "missing_effect" and r["said"] != [r["law"]],
-    }
-    lines = []
-    for what, hit in came.items():
-        for low, high in pairwise(_BINS):
-            cells = [row for row in hidden if low <= row[what] < high or row[what] == high == 1.0]
-            if cells:
-                mean = f"{np.mean([row[what] for row in cells]):.0%}"
-                lines.append([what, f"{low:.0%} to {high:.0%}", len(cells), mean, share(map(hit, cells))])
-    text = markdown("of what | chance stated | cells | mean of it | came", lines)
-    if empty:
-        alarms = share(row["verdict"] != "adequate" for row in empty)
-        square = f"{np.mean([row['chi_square'] for row in empty]) / 6:.2f}"
-        text += [
-            "",
-            f"Nothing hidden: {alarms} alarm; χ²/6 of the hand-eye under the stated covariance {square} on average.",
-        ]
-    if len(rows) < _ENOUGH:
-        text += ["", f"Only {len(rows)} cells so far: too few to say that the chances are calibrated."]
-    return text
-
-
-CHANCES = Table(chance_jobs, chance_trial, chance_summary, range(40), page="plan", block="chances")

@@ -1,59 +1,47 @@
-"""Do names hold, and do unknowns stay unknown? Worlds that no model holds, judged blind; and an oracle beside.
+"""Do names hold, and do unknowns stay unknown? Worlds that no model holds, judged blind.
 
 Every cell is simulated and run once; what its views show in other worlds is then drawn. Sizes of effects are multiples
 of what an arm that only scatters would show at the least in that cell. Seeds are of two kinds: those of development, 0
 and 1, and held-out ones, to be run once for each version of the diagnosis; used up: 848 to 963. `--set before=true`
 asks as if poses scattered independently from view to view; `--set fewer=N` takes the first N-th of the trials.
-
-How much larger must an effect be for the diagnosis than for an oracle that knows which it is, and all variances? The
-oracle makes one test at the level of an alarm: χ² over all numbers of the true effect, beside an unknown hand-eye,
-under the scatter and noise that the draws really have. Each draw is of an effect at a multiple of what the oracle
-detects in eight draws of ten; counted is what is not called adequate. Some 40 minutes.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.optimize import brentq, isotonic_regression
-from scipy.stats import chi2, ncx2
 
-from bench.drawn_cells import SCATTER, LinearCell, World, linear_cell, seen, true_column, with_overlaps_of
+from bench.drawn_cells import SCENES, LinearCell, World, linear_cell, seen, true_column, with_overlaps_of
 from bench.harness import Row, Table, grouped, markdown, share
-from bench.small_cells import LIBRARY, SCENES, drawn, smallest
 from data_synth import nature
-from data_synth.laws.blind_first import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
-from data_synth.laws.blind_second import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
-from data_synth.laws.blind_third import LATER, LATER_IN_TIME, LATER_OF_FLANGE
 from data_synth.laws.unnamed import IN_TIME, UNNAMED
+from data_synth.moment import Plan
 from data_synth.ordinary_arm import draw_arm, with_memory
-from stitch.diagnosis.candidates import Candidate, Form, candidate_of
+from data_synth.scene import load_scene
+from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
-from stitch.diagnosis.score import ScatterLimit
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import ScatterLimit, form_weights
 from stitch.diagnosis.sensitivity import least_noncentrality
-from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, ODDS, POWER
+from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors
 from stitch.diagnosis.verdict import Evidence
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
-from stitch.numerics.frames import Array
-from stitch.numerics.reml import at_variances
 from stitch.observations.linear_model import LinearModel
+from stitch.session.measurement import Measurement
 
+# The beams of brackets are written in other numbers than the library's.
+LIBRARY = tuple(name for name in nature.LAWS if name in EFFECTS and not name.endswith(("_droop", "_bend")))
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 MULTIPLES = (1, 2, 3, 4, 6)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
-MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES), "foreign_3x", "further_3x", "later_3x")
+MUST_SHOW = ("effect", *AGAIN, *(f"unnamed_{n}x" for n in MULTIPLES))
 OF_THE_ARM = ("joint_offset", "link_geometry", "gear_eccentricity")
-ORACLE_MULTIPLES = (1.0, 1.5, 2.0, 3.0)
 # Usual sizes of a law, 0.15 mrad or 0.05 mm rms: what errs by more is broken.
 _MOST = 10.0
-# A number of an effect counts for the oracle if the views show it at its plausible size as more than a tenth of a
-# sigma.
-_SEEN = 0.1
-
 # A world, and what of it may be named: of a cell, for the k-th draw of a part.
 Drawn = tuple[World, tuple[str, ...]]
 Part = Callable[[LinearCell, np.random.Generator, int], Drawn]
@@ -77,21 +65,15 @@ def joint_scatter(cell: LinearCell, rng: np.random.Generator, k: int) -> Drawn:
 
 
 def unnamed(cell: LinearCell, rng: np.random.Generator, k: int) -> Drawn:
-    """A law outside every dictionary; couplings as often as three others."""
+    """A law outside every dictionary, couplings as often as three others; and the joint that follows it, or time."""
     law = _in_turn(["coupling", "coupling", *(n for n in UNNAMED if n != "coupling")], k)
-    return _erring(cell, rng, law, UNNAMED[law], of_flange=law in IN_TIME)
-
-
-def by_another_hand(
-    cell: LinearCell,
-    rng: np.random.Generator,
-    k: int,
-    laws: Mapping[str, Callable[..., Array]],
-    of_flange: Sequence[str],
-) -> Drawn:
-    """A law of those that were written apart from all that looks for laws."""
-    law = _in_turn(list(laws), k)
-    return _erring(cell, rng, law, laws[law], of_flange=law in of_flange)
+    time = np.array([moment.time for moment in cell.moments])
+    if law in IN_TIME:
+        errors = UNNAMED[law](cell.plan, rng, time / np.median(np.diff(time)))
+        return World(_laws(cell, {}, rng), flange_errors=errors), (law,)
+    errors = UNNAMED[law](cell.plan, rng)
+    followed = (f"joint {k + 1}" for k in np.flatnonzero(np.ptp(errors, axis=0)))
+    return World(_laws(cell, {}, rng), joint_errors=errors), (law, *followed)
 
 
 def at_multiple(cell: LinearCell, rng: np.random.Generator, k: int, make: Part, multiple: float) -> Drawn:
@@ -131,10 +113,6 @@ def several(cell: LinearCell, rng: np.random.Generator, k: int, count: int) -> D
     return _at(cell, chosen, 4.0, rng)
 
 
-# The second eight were written after what the first showed was mended, the third after the second were measured.
-FIRST_EIGHT = partial(by_another_hand, laws=FOREIGN, of_flange=FOREIGN_OF_FLANGE)
-SECOND_EIGHT = partial(by_another_hand, laws=FURTHER, of_flange=FURTHER_OF_FLANGE)
-THIRD_EIGHT = partial(by_another_hand, laws=LATER, of_flange=LATER_OF_FLANGE)
 # By name: how a world of the part is drawn, and how often. The order is part of the seeds.
 PARTS: dict[str, tuple[Part, int]] = {
     "nothing": (nothing, 100),
@@ -146,28 +124,8 @@ PARTS: dict[str, tuple[Part, int]] = {
     "three": (partial(several, count=3), 42),
     **{f"unnamed_{n}x": (partial(at_multiple, make=unnamed, multiple=float(n)), 60) for n in MULTIPLES},
     "arm": (arm, 36),
-    "foreign": (FIRST_EIGHT, 64),
-    "foreign_3x": (partial(at_multiple, make=FIRST_EIGHT, multiple=3.0), 64),
-    "further": (SECOND_EIGHT, 64),
-    "further_3x": (partial(at_multiple, make=SECOND_EIGHT, multiple=3.0), 64),
-    "later": (THIRD_EIGHT, 64),
-    "later_3x": (partial(at_multiple, make=THIRD_EIGHT, multiple=3.0), 64),
     "joint_scatter": (joint_scatter, 100),
 }
-
-
-def _erring(
-    cell: LinearCell, rng: np.random.Generator, law: str, errors: Callable[..., Array], of_flange: bool
-) -> Drawn:
-    """A world with a law, and what of it may be told: the joint that follows it, or that it is of all of them."""
-    time = np.array([moment.time for moment in cell.moments])
-    in_time = law in (*IN_TIME, *FOREIGN_IN_TIME, *FURTHER_IN_TIME, *LATER_IN_TIME)
-    times = (time / np.median(np.diff(time)),) if in_time else ()
-    error = errors(cell.plan, rng, *times)
-    world = World(_laws(cell, {}, rng), **{"flange_errors" if of_flange else "joint_errors": error})
-    if of_flange:
-        return world, (law,) if in_time else (law, "joints")
-    return world, (law, *(f"joint {k + 1}" for k in np.flatnonzero(np.ptp(error, axis=0))))
 
 
 def _laws(cell: LinearCell, hidden: dict[str, float], rng: np.random.Generator) -> nature.Nature:
@@ -195,10 +153,51 @@ def _in_turn(names: Sequence[str], k: int) -> str:
 def _at(cell: LinearCell, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> Drawn:
     chance = int(rng.integers(1 << 30))
     plain = cell.linear.restricted(())
-    true = drawn(cell.name, cell.plan, cell.measurement, laws, chance)
-    sizes = {law: smallest(plain, law, true[law]) for law in laws}
+    true = _drawn(cell.name, cell.plan, cell.measurement, laws, chance)
+    sizes = {law: _smallest(plain, law, true[law]) for law in laws}
     hidden = {law: multiple * size for law, size in sizes.items() if size is not None}
     return World(_laws(cell, hidden, np.random.default_rng([chance, 2]))), tuple(hidden)
+
+
+def _drawn(
+    name: str, plan: Plan, measurement: Measurement, laws: Sequence[str], chance: int
+) -> dict[str, dict[str, float]]:
+    """Return what nature draws for these laws, in this order, at amplitude 1 in this very cell, as a model counts
+    it."""
+    out = nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
+    if "part_growth" in out:
+        # About another origin than the part's own, growth is a motion too.
+        off = measurement.scan_views[0].origin - load_scene(name).T_reference_part[:3, 3]
+        out["part_growth"] |= dict(zip(("cx", "cy", "cz"), out["part_growth"]["g"] * off, strict=True))
+    return out
+
+
+def _smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float | None:
+    """Return the factor on the parameters `true` that is detectable at the least; None where cell or belief cannot
+    hold it."""
+    if missing_need(linear.measurement, EFFECTS[effect]) or not true:
+        return None
+    candidate = candidate_of(linear, EFFECTS[effect])
+    if candidate is None:
+        return None
+    linear = linear.restricted(linear.causes - {effect})
+    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
+    fitted = np.array([not p.grid for p in candidate.parameters])
+    sizes = []
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        # Forms that hold all of the truth, at the value of the grid that is nearest to it.
+        off = np.abs(form.term.values - values)[~fitted].sum()
+        if not values[fitted & ~form.keep].any():
+            white = linear.residual(form.columns)
+            freedom = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
+            scales = regime_of(linear).scales
+            least = least_noncentrality(white * form.sizes, float(weight), len(EFFECTS), freedom, scales)
+            sizes.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
+    nearest = min(off for off, _ in sizes)
+    amplitude = float(min(size for off, size in sizes if off == nearest))
+    # Four times that must still be of a size that somebody would believe.
+    limits = np.array([p.limit for p in candidate.parameters])
+    return amplitude if (np.abs(values) * 4 * amplitude < limits)[fitted].all() else None
 
 
 def jobs(seeds: range, before: bool, fewer: int) -> Iterator[Row]:
@@ -320,86 +319,3 @@ def summary(rows: list[Row]) -> list[str]:
 
 
 TABLE = Table(jobs, trial, summary, range(2), settings={"before": False, "fewer": 1})
-
-
-def oracle_jobs(seeds: range, draws: int) -> Iterator[Row]:
-    """Every effect at every multiple, over the cells in turn."""
-    cells = [(seed, name) for seed in seeds for name in SCENES]
-    for name in LIBRARY:
-        for multiple in ORACLE_MULTIPLES:
-            for k in range(draws):
-                seed, scene = cells[k % len(cells)]
-                yield {"effect": name, "multiple": multiple, "draw": k, "scene": scene, "seed": seed}
-
-
-def oracle_trial(job: Row) -> Row:
-    """Whether something is said to be missing in one draw; None where the cell cannot have or show the effect."""
-    name, cell = job["effect"], linear_cell(job["scene"], job["seed"])
-    # The same effect at every multiple.
-    chance = [cell.seed, job["draw"], LIBRARY.index(name)]
-    rng = np.random.default_rng([*chance, int(100 * job["multiple"])])
-    chance_of_law = int(np.random.default_rng(chance).integers(1 << 30))
-    true = drawn(cell.name, cell.plan, cell.measurement, [name], chance_of_law)[name]
-    size = _oracle_size(cell, name, true) if true else None
-    if size is None:
-        return {"detected": None}
-    laws = _laws(cell, {name: job["multiple"] * size}, np.random.default_rng([chance_of_law, 2]))
-    evidence = gather_evidence(seen(cell, World(laws), rng), cell.candidates, USUAL)
-    return {"detected": evidence.verdict != "adequate"}
-
-
-def _oracle_size(cell: LinearCell, name: str, true: dict[str, float]) -> float | None:
-    """Factor on the parameters `true` that the oracle detects in eight draws of ten; None where a cell cannot."""
-    if missing_need(cell.measurement, EFFECTS[name]):
-        return None
-    candidate = candidate_of(cell.linear, EFFECTS[name])
-    if candidate is None:
-        return None
-    form = nearest_form(candidate, true)
-    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
-    variances = np.array([SCATTER[0] ** 2, SCATTER[3] ** 2, cell.noise_factor])
-    mixed = replace(cell.linear.mixed, components=cell.linear.mixed.components[:3], further=None)
-    known = replace(cell.linear, mixed=mixed, null=at_variances(mixed, variances), pose_errors=None)
-    white = known.residual(form.columns)
-    rank = int((np.linalg.svd(white * form.sizes, compute_uv=False) > _SEEN).sum())
-    length = float(np.linalg.norm(white @ values[form.keep]))
-    if rank == 0 or length == 0:
-        return None
-    limit = float(chi2.isf(ALPHA_NAME, rank))
-    return float(np.sqrt(brentq(lambda shift: ncx2.sf(limit, rank, shift) - POWER, 1e-3, 1e3))) / length
-
-
-def nearest_form(candidate: Candidate, true: dict[str, float]) -> Form:
-    """Return the form of a candidate with all fitted parameters whose grid lies nearest to the true values."""
-    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
-    fitted = np.array([not p.grid for p in candidate.parameters])
-    whole = [form for form in candidate.forms if form.keep.sum() == fitted.sum()]
-    return min(whole, key=lambda form: float(np.abs(form.term.values - values)[~fitted].sum()))
-
-
-def oracle_summary(rows: list[Row]) -> list[str]:
-    """A line an effect: shares found at every multiple, of how many draws, and the multiple at which eight of ten are;
-    the median of those."""
-    lines, ratios = [], []
-    for name, group in grouped(rows, "effect").items():
-        hits = [
-            [r["detected"] for r in group if r["multiple"] == m and r["detected"] is not None] for m in ORACLE_MULTIPLES
-        ]
-        if not all(hits):
-            continue
-        shares = np.array([np.mean(flags) for flags in hits])
-        rising = isotonic_regression(shares).x
-        if rising[0] >= POWER:
-            ratio, text = ORACLE_MULTIPLES[0], f"at most {ORACLE_MULTIPLES[0]:g}"
-        elif rising[-1] >= POWER:
-            ratio = float(np.interp(POWER, rising, ORACLE_MULTIPLES))
-            text = f"{ratio:.1f}"
-        else:
-            ratio, text = np.inf, f"above {ORACLE_MULTIPLES[-1]:g}"
-        ratios.append(ratio)
-        lines.append([name, min(map(len, hits)), *(f"{s:.2f}" for s in shares), text])
-    head = f"effect | draws | {' | '.join(f'{m:g}×' for m in ORACLE_MULTIPLES)} | ratio at 80 %"
-    return [*markdown(head, lines), "", f"Median ratio {np.median(ratios):.2f}."]
-
-
-ORACLE = Table(oracle_jobs, oracle_trial, oracle_summary, range(2), settings={"draws": 12})
