@@ -43,7 +43,7 @@ _STEPS = 8
 
 
 @dataclass(frozen=True)
-class Cell:
+class LinearCell:
     """One simulated session, its views freed about the true hand-eye."""
 
     name: str  # of the scene
@@ -54,22 +54,7 @@ class Cell:
     measurement: Measurement
     views: UnconstrainedPoses
     noise_factor: float
-
-    @property
-    def flange(self) -> Array:
-        """(V, 4, 4) reported."""
-        return on_rail(kinematics.flange(self.plan.arm, self.plan.joints), self.rail)
-
-    @property
-    def stops(self) -> Array:
-        """(V,) number of the stop at which each view was taken."""
-        return np.unique(self.plan.joints.round(6), axis=0, return_inverse=True)[1].ravel()
-
-
-@dataclass(frozen=True)
-class LinearCell(Cell):
-    """A cell with what is asked of it; the same for every draw, but for the numbers that are seen."""
-
+    # What is asked of it; the same for every draw, but for the numbers that are seen.
     scene: Scene
     moments: list[Moment]
     linear: LinearModel
@@ -100,15 +85,11 @@ def hand_eye_chi_square(measured: Measured, state: RunData) -> float:
 
 
 @lru_cache(maxsize=16)
-def cell_of(name: str, seed: int, scans_a_stop: int = 1) -> Cell:
-    """Simulate a session with nothing wrong but scatter, and free its views about the true hand-eye; of fewer stops
-    where each is scanned several times."""
+def linear_cell(name: str, seed: int) -> LinearCell:
+    """Simulate a session with nothing wrong but scatter, free its views, linearise about the true hand-eye."""
     plan, rail = plan_for(load_scene(name), seed)
-    if scans_a_stop > 1:
-        again = np.repeat(np.arange(len(rail) // scans_a_stop + 2), scans_a_stop)
-        of_views = {key: getattr(plan, key)[again] for key in ("joints", "torque", "velocity")}
-        plan, rail = replace(plan, **of_views), rail[again]
-    measured = simulate(scene_of(name), {}, seed, planned=(plan, rail))
+    scene = scene_of(name)
+    measured = simulate(scene, {}, seed, planned=(plan, rail))
     session, T_mount = session_of(measured), measured.T_mount
     measurement = with_part_origin(measurement_of(session, prepare_capture(session)), T_mount)
     capture = measurement.capture
@@ -117,20 +98,14 @@ def cell_of(name: str, seed: int, scans_a_stop: int = 1) -> Cell:
     coarse = collect_overlaps(capture, poses, GATE * part_size([capture]), samples)
     views = unconstrained_poses(capture, poses, next_gate(coarse, capture))
     noise_factor = capture_repeatability(capture, views, T_mount).noise_factor
-    return Cell(name, seed, plan, rail, T_mount, measurement, views, noise_factor)
+    linear = surface_model(measurement, Model(T_mount), capture, views)
+    moments = moments_of(scene, plan, measurement.views.time, measurement.views.covariates)
+    candidates = candidates_of(linear)[0]
+    made = (name, seed, plan, rail, T_mount, measurement, views, noise_factor)
+    return LinearCell(*made, scene=scene, moments=moments, linear=linear, candidates=candidates)
 
 
-@lru_cache(maxsize=16)
-def linear_cell(name: str, seed: int) -> LinearCell:
-    """Simulate, run and linearise a cell about its true hand-eye."""
-    cell = cell_of(name, seed)
-    scene, views = scene_of(name), cell.measurement.views
-    linear = surface_model(cell.measurement, Model(cell.T_mount), cell.measurement.capture, cell.views)
-    moments = moments_of(scene, cell.plan, views.time, views.covariates)
-    return LinearCell(**vars(cell), scene=scene, moments=moments, linear=linear, candidates=candidates_of(linear)[0])
-
-
-def shown(cell: Cell, T_reference_scanner: Array, rng: np.random.Generator) -> UnconstrainedPoses:
+def shown(cell: LinearCell, T_reference_scanner: Array, rng: np.random.Generator) -> UnconstrainedPoses:
     """Return what the overlaps would show of true poses (V, 4, 4), with the noise of their normal equations."""
     g = cell.views.overlaps.gram
     to_centre = frames.make(np.eye(3), -g.centre)

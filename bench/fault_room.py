@@ -27,8 +27,6 @@ KILLED = {
     "run": ["run", "o", "-o", "r", "--force", "--no-recording"],
     "add": ["add", "r", "incidence_bias", "--no-recording"],
 }
-# What changes a folder, as the interpreter announces it before it is done.
-_CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod")
 TRIED_AGAIN = 5  # after every so many kills the command runs once more, to its end
 _HANG = 10.0  # seconds beyond what a good run takes here
 # What differs from run to run although the numbers are the same.
@@ -194,34 +192,6 @@ def killed(command: str, share: float, try_again: bool) -> Row:
     state = _contents(room / "r")
     left = "old" if state == _contents(material()[1] / "r") else "new" if state == new else "neither"
     return {"left": left, "works": not try_again or _works_on(command, room)}
-
-
-def killed_at(command: str, event: int, after: float) -> Row:
-    """Kill a command so many seconds after it opened, made, renamed or removed something in its room for the n-th
-    time; return what is left, as `killed` does."""
-    _, new = _whole(command)
-    room = _kill_room(command)
-    process = _forked(lambda: _until_event(command, room, event, after))
-    _, status = os.waitpid(process, 0)
-    state = _contents(room / "r")
-    left = "old" if state == _contents(material()[1] / "r") else "new" if state == new else "neither"
-    return {"left": left, "killed": os.WIFSIGNALED(status), "works": _works_on(command, room)}
-
-
-def _until_event(command: str, room: Path, event: int, after: float) -> None:
-    seen = 0
-
-    def count(name: str, arguments: tuple[object, ...]) -> None:
-        nonlocal seen
-        writes = name == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
-        if (writes or name in _CHANGES) and str(room) in os.path.abspath(str(arguments[0])):
-            seen += 1
-            if seen == event:
-                # The default answer to this signal is the end of the process.
-                signal.setitimer(signal.ITIMER_REAL, after)
-
-    sys.addaudithook(count)
-    _quietly(command, room)
 
 
 def _kill_room(command: str) -> Path:

@@ -18,7 +18,6 @@ from bench import harness  # noqa: E402
 TABLES = {
     "axes": "axes:TABLE",
     "bad-arms": "real_arms:BAD_ARMS",
-    "batch-speed": "watch:SPEED",
     "certificate": "certificate:TABLE",
     "conventions": "intake:CONVENTIONS",
     "days": "points:DAYS",
@@ -41,7 +40,6 @@ TABLES = {
     "mistakes-in-many-views": "integrity:MANY",
     "mistakes-in-measured-scans": "integrity:MEASURED",
     "no-mistake": "integrity:GOOD",
-    "ordinary-arms": "hand_eye_sigmas:ORDINARY_ARMS",
     "outside-cells": "outside_cells:TABLE",
     "scanners": "scanners:TABLE",
     "stock": "stock:TABLE",

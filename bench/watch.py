@@ -1,15 +1,10 @@
-"""A cell over days, and many sessions at once.
+"""A cell over days: false alarms, what is named and when, coverage, time and size; then a real arm over hours.
 
-TABLE: A cell over days: false alarms, what is named and when, coverage, time and size; then a real arm over hours. The
+The
 real arm is the UR10's series A: 11,911 poses with a tracker, their times and the temperature of the air. Every block is
 a session of its own, run with joint offsets and link geometry as effects, and appended to the history of a cell.
-
-SPEED: two workers against one on many small sessions.
 """
 
-import os
-import re
-import shutil
 import tempfile
 import time
 from collections.abc import Iterator
@@ -20,11 +15,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown, stitch_process
+from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
-from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.cell_records import records_of
-from data_synth.write import write_session
 from stitch.api.pipeline import run
 from stitch.model.model_toml import ModelFile
 from stitch.numerics.units import length_text
@@ -51,9 +44,6 @@ _PARAMETERS = 12
 _CHANNELS = ["air_temperature_c"]
 _Z95 = 1.96
 _MORE = 40
-SESSIONS = 64
-# By name: workers, and whether they share one core.
-WAYS = {"one worker, one core": (1, True), "one process, all cores": (1, False), "two workers": (2, False)}
 
 
 def jobs(seeds: range, cells: int) -> Iterator[Row]:
@@ -314,48 +304,3 @@ PARTS = Parts(
 TABLE = Table(
     jobs, PARTS.trial, PARTS.summary, range(HALLS), page="watch", block="tables", settings={"cells": CELLS_OF_HALL}
 )
-
-
-def speed_jobs(seeds: range, sessions: int) -> Iterator[Row]:
-    """The ways of running so many small sessions."""
-    yield from ({"way": way, "sessions": sessions} for way in WAYS)
-
-
-def speed_trial(job: Row) -> Row:
-    """The whole command on blades in 6 views of some 900 points, each with a name of its own."""
-    workers, on_one = WAYS[job["way"]]
-    with tempfile.TemporaryDirectory() as name:
-        sessions = [Path(name) / f"s{i:03d}" for i in range(job["sessions"])]
-        write_session(sessions[0], measured_blade(0, views=6, pixels=60), sessions[0].name)
-        for place in sessions[1:]:
-            shutil.copytree(sessions[0], place)
-            file = place / "session.toml"
-            file.write_text(re.sub(r"(?m)^name = .*$", f'name = "{place.name}"', file.read_text()))
-        cores = {min(os.sched_getaffinity(0))} if on_one else None
-        load = os.getloadavg()[0]
-        return {
-            "load": load,
-            **stitch_process("batch", *sessions, "-o", f"{name}/runs", "--workers", workers, cores=cores),
-        }
-
-
-def speed_summary(rows: list[Row]) -> list[str]:
-    """A row a way of running them; how busy the machine was with other things stands below."""
-    lines = []
-    for row in rows:
-        times, cores = rows[0]["seconds"] / row["seconds"], row["cpu"] / row["seconds"]
-        lines.append([row["way"], f"{row['seconds']:.0f}", f"{times:.2f}", f"{row['cpu']:.0f}", f"{cores:.2f}"])
-    return [
-        f"**{rows[0]['sessions']} small sessions** (6 views of some 900 points each, with recording and page), the "
-        "whole command",
-        "",
-        *markdown("way | s | times one worker | CPU s | cores in use", lines),
-        "",
-        f"{os.cpu_count()} cores; load average of the machine before: {rows[0]['load']:.1f}.",
-    ]
-
-
-SPEED = Table(
-    speed_jobs, speed_trial, speed_summary, range(1), page="scale", block="speed", one_core=False,
-    settings={"sessions": SESSIONS},
-)  # fmt: skip
