@@ -1,11 +1,17 @@
-"""The code stays within budget.toml: its lines, and the functions that a run and a diagnosis enter."""
+"""The code stays within budget.toml: its lines, and the functions that a run and a diagnosis enter.
+
+The programs of the gallery: each is short, and does in an empty folder what its first line says.
+"""
 
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
-from bench.budget import BUDGET, complaints
+import pytest
+
+from bench.budget import BUDGET, code_lines, complaints
+from tests.needs import needs_open3d
 
 # Counted in a fresh process, where nothing is remembered and every thread is watched.
 WALK = """
@@ -38,6 +44,16 @@ session = stitch.load_session(sys.argv[1])
 run = count(lambda: stitch.run(session))
 count(lambda: stitch.diagnose(run))
 """
+PROGRAMS = sorted((Path(__file__).parents[1] / "examples" / "python").glob("*.py"))
+# What a program prints, and the file that it writes.
+TOLD = {
+    "feature_and_verify": ("The artefact passes", None),
+    "live_loop": ("v008: does not belong", None),
+    "open3d_in_and_out": ("T_flange_scanner", "stitched.ply"),
+    "organised_clouds": ("T_flange_scanner", "stitched.glb"),
+    "own_effect": ("", "error.png"),
+    "twenty_sessions": ("cell-19", None),
+}
 
 
 def test_a_part_above_its_budget_and_a_budget_far_above_its_part_are_refused():
@@ -56,3 +72,22 @@ def test_a_run_and_a_diagnosis_enter_no_more_functions_than_budgeted(tmp_path, s
         functions, files = map(int, line.split())
         assert functions <= budget[name]["functions"], name
         assert files <= budget[name]["files"], name
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.stem)
+def test_a_program_is_short(program):
+    assert code_lines(program) <= 14 and program.stem in TOLD
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda program: program.stem)
+def test_a_program_does_what_it_says(program, tmp_path):
+    if "open3d" in program.stem:
+        needs_open3d()
+    if "pandas" in program.read_text():
+        pytest.importorskip("pandas")
+    done = subprocess.run([sys.executable, program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    said, file = TOLD[program.stem]
+    assert done.returncode == 0, done.stderr
+    assert said in done.stdout
+    assert file is None or (tmp_path / file).stat().st_size > 1000

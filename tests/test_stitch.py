@@ -1,4 +1,7 @@
-"""What `import stitch` offers, what it loads before it does anything, and that a wheel runs where nothing else is installed."""
+"""What `import stitch` offers, what it loads before it does anything, and that a wheel runs where nothing else is installed.
+
+Errors speak the caller's language: what to type, and what to write in a program.
+"""
 
 import ast
 import inspect
@@ -30,8 +33,10 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
+from stitch.cli.main import main
 from stitch.diagnosis.diagnosis import Proposal
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
+from stitch.errors import InputError, NoResultError, did_you_mean
 from stitch.model.axis_places import AxisPlace
 from stitch.observations.scanner_places import ScannerAlone, ScannerPlace
 from stitch.observations.targets.outliers import Outlier
@@ -109,6 +114,8 @@ def test_the_example_of_the_package_runs(tmp_path, capsys):
 
 
 DEAR = {"scipy.stats", "matplotlib", "rerun", "trimesh", "open3d", "dask", "distributed", "cv2", "jsonschema"}
+
+
 # What a command needs to say what it could do.
 LIGHT = DEAR | {"numpy", "scipy", "pyarrow", "asyncio"}
 
@@ -211,8 +218,12 @@ STRIPPED = """
     ctypes.CDLL.__init__ = stripped
     sys.modules["open3d"] = None
 """
+
+
 # Parts of every Debian: the C library's and the compiler's. Pillow looks for fribidi and does without.
 C_LIBRARY = ("libm.so", "librt.so", "libdl.so", "libpthread.so", "libutil.so")
+
+
 ALWAYS = (*C_LIBRARY, "libstdc++.so", "libgcc_s.so", "libfribidi.so")
 
 
@@ -393,6 +404,8 @@ def values(tmp_path_factory):
 
 # Views of a session that grows, with its threads and its recording: no value. The table is pyarrow's.
 NO_VALUES = {"LiveSession"}
+
+
 NO_CLASS_OF_STITCH = {"Table"}
 
 
@@ -433,3 +446,49 @@ def test_a_run_that_came_from_another_process_goes_on(values):
     assert all("tree" not in vars(scan) for scan in came.measurement.capture.scans)
     assert str(stitch.diagnose(came).sentence) == values["Diagnosis"].sentence
     assert stitch.compare(came) == values["ResidualTables"]
+
+
+def test_one_fix_in_the_message_serves_both_callers():
+    error = InputError("views.csv line 3: no scan v7.ply; to fix: add it")
+    assert str(error) == error.command_line == "views.csv line 3: no scan v7.ply; to fix: add it"
+    assert error.what == "views.csv line 3: no scan v7.ply"
+    assert error.fix_cli == error.fix_python == "add it"
+
+
+def test_two_fixes_are_told_to_their_callers_alone():
+    error = NoResultError("hand-eye: not seen", fix_cli="state --hand-eye RUN", fix_python="pass model=run")
+    assert str(error) == "hand-eye: not seen; to fix: pass model=run"
+    assert error.command_line == "hand-eye: not seen; to fix: state --hand-eye RUN"
+
+
+def test_a_message_without_a_fix_is_only_itself():
+    assert str(InputError("nothing")) == InputError("nothing").command_line == "nothing"
+
+
+def test_what_an_error_says_survives_a_process_pool():
+    error = InputError("a", fix_cli="b", fix_python="c")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.command_line, vars(again)) == (str(error), error.command_line, vars(error))
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("rangescale", "range_scale"), ("Range-Scale", "range_scale"), ("range_scal", "range_scale")],
+)
+def test_a_name_that_is_nearly_right_is_named(written, meant):
+    assert did_you_mean(written, ["joint_offsets", "range_scale"]) == f"; did you mean {meant!r}?"
+
+
+def test_a_name_that_is_like_none_suggests_none():
+    assert did_you_mean("xyz", ["joint_offsets", "range_scale"]) == ""
+
+
+def test_the_command_line_prints_the_fix_to_type(capsys, monkeypatch):
+    def fails(*_):
+        raise InputError("there already", fix_cli="state --force", fix_python="pass force=True")
+
+    monkeypatch.setattr("stitch.cli.main.build", lambda: fails)
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.strip() == "stitch: there already; to fix: state --force"

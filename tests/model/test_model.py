@@ -1,4 +1,9 @@
-"""The model of a cell: what is printed of its hand-eye, the covariance of its effects, its file, and its use in sessions."""
+"""The model of a cell: what is printed of its hand-eye, the covariance of its effects, its file, and its use in sessions.
+
+The hand-eye without its model: at the mean of the effects over the views, with what single views differ by.
+
+What a model hands on to another session.
+"""
 
 from dataclasses import replace
 
@@ -8,10 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.edits import edit
 from data_synth.fixtures.in_memory import session_of
-from stitch.api.pipeline import require_effects, run_rig
+from data_synth.fixtures.labelled_arm import TABLE, TARGETS, flange, joints_of, labelled_cell
+from stitch.api.pipeline import require_effects, run, run_rig
 from stitch.effects import EFFECTS
 from stitch.effects.contract import parameters_in
 from stitch.errors import InputError
+from stitch.model.hand_eye_alone import hand_eye_alone
 from stitch.model.model import (
     EffectsCovariance,
     Term,
@@ -21,11 +28,24 @@ from stitch.model.model import (
     printed_covariance,
     term_of,
 )
-from stitch.model.model_toml import ModelFile, bind_to_session, convert_unit, read_model, write_model
+from stitch.model.model_toml import (
+    ModelFile,
+    arm_model,
+    bind_to_session,
+    convert_unit,
+    read_model,
+    without_events,
+    write_model,
+)
 from stitch.numerics import frames
+from stitch.output.result_document import model_of
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.robot import unit_torques
+
+SHIFT = np.array([0, 0, 0, 2.0, -1.0, 0.5])
+SLIP = np.array([0.02, -0.01, 0.03]), np.array([1.0, -2.0, 0.5])  # rad, mm, reference frame
+SLIPPED_AT, OTHER_SESSION = 30, 50
 
 
 @pytest.mark.parametrize("angle", [1e-5, 0.8, 3.1])
@@ -236,3 +256,90 @@ def test_a_number_of_an_effect_that_cannot_be_is_refused_in_a_line(tmp_path, val
     file.write_text(text + table, "utf-8")
     with pytest.raises(InputError, match=r"effects\.joint_offset\.o1 is .*; to fix: copy that of the run"):
         read_model(file)
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_without_effects_of_base_arm_or_mount_there_is_no_other(mount):
+    fitted = run(labelled_cell(3, 20, mount)[0], effects=["part_slip"])
+    assert hand_eye_alone(fitted.measurement, fitted.model) is None
+
+
+def test_a_bracket_that_droops_alike_in_all_views_is_in_the_hand_eye():
+    """The mean twist of the views, written out: g less z of each, times what the bracket gives way by."""
+    joints = joints_of(np.random.default_rng(5), 30)
+    turned = np.array([flange(q)[:3, :3].T @ [0, 0, -1.0] for q in joints]) - [0, 0, 1.0]
+    lever, sideways = np.array([2e-3, -3e-3, 4e-3]), 1.5
+    moved = np.hstack([np.cross(lever, turned), sideways * turned * [1, 1, 0]])
+    session, T_mount, _ = labelled_cell(5, 30, "eye_in_hand", errors=(np.zeros((30, 6)), moved))
+    with_it = run(session, effects=["mount_droop"])
+    alone = hand_eye_alone(with_it.measurement, with_it.model)
+    expected = frames.exp(moved.mean(axis=0)) @ T_mount
+    middle = np.mean([view.sighting.points.mean(axis=0) for view in session.views], axis=0)[None]
+
+    def apart(T, other):
+        return float(np.linalg.norm(frames.transform(T, middle) - frames.transform(other, middle)))
+
+    assert apart(with_it.T_mount, expected) > 0.2
+    assert apart(alone.T_mount, expected) < 0.15 * apart(with_it.T_mount, expected)
+    assert alone.displacement == pytest.approx(apart(alone.T_mount, with_it.T_mount), rel=1e-6)
+    spread = [apart(frames.exp(twist) @ T_mount, expected) for twist in moved]
+    assert alone.spread == pytest.approx(np.sqrt(np.mean(np.square(spread))), rel=0.2)
+    # Its U is no smaller than what single views differ by.
+    lever = np.hstack([-frames.skew(middle[0]), np.eye(3)])
+    assert np.trace(lever @ alone.covariance @ lever.T) >= alone.spread**2
+
+
+def test_a_step_of_the_mount_counts_as_it_ended():
+    session, *_ = labelled_cell(6, 24)
+    fitted = run(session, effects=["mount_step"])
+    (step,) = fitted.terms
+    values = np.where([p.discrete for p in step.parameters], 12.0, np.append(SHIFT, 0.0))
+    model = fitted.model.with_terms([step.at(values)])
+    alone = hand_eye_alone(fitted.measurement, model)
+    np.testing.assert_allclose(alone.T_mount, fitted.T_mount @ frames.exp(SHIFT), atol=1e-9)
+    assert alone.spread == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def sessions():
+    """A session in which the part slips before a view, and a later one of the same cell."""
+    turn = Rotation.from_rotvec(SLIP[0]).as_matrix()
+    slipped = (TARGETS + TABLE) @ turn.T + SLIP[1] - TABLE
+    before, after = (labelled_cell(7, 80, "eye_in_hand", targets=places)[0] for places in (TARGETS, slipped))
+    views = before.views[:SLIPPED_AT] + after.views[SLIPPED_AT:]
+    return replace(before, views=views[:OTHER_SESSION]), replace(before, views=views[OTHER_SESSION:])
+
+
+def test_a_slip_stays_in_its_session_and_the_targets_stand_where_they_ended(sessions):
+    first, later = sessions
+    file = model_of(run(first, effects=["part_slip"]))
+    assert "part_slip" in file.effects
+    handed_on = without_events(file)
+    assert handed_on.effects == {} and handed_on.T_mount is file.T_mount
+    again = run(later, file)
+    assert again.model.terms == ()
+    noise = run(later).fit.stages[-1].rms
+    assert again.fit.stages[0].rms < 3 * noise + 0.05
+
+
+def test_after_a_step_of_the_mount_another_session_finds_the_scanner_where_it_ended():
+    xi = np.array([1e-3, -2e-3, 5e-4, 0.3, -0.2, 0.1])
+    still = labelled_cell(8, 30)[0]
+    moved = [
+        replace(v, sighting=replace(v.sighting, points=_in_moved_scanner(v.sighting.points, xi))) for v in still.views
+    ]
+    stepped = replace(still, views=(*still.views[:15], *moved[15:]))
+    handed_on = without_events(model_of(run(stepped, effects=["mount_step"])))
+    assert handed_on.effects == {}
+    ended = run(replace(still, views=tuple(moved))).T_mount
+    off = np.linalg.inv(ended) @ handed_on.T_mount
+    assert np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec()) < 1e-4
+
+
+def _in_moved_scanner(points, xi):
+    turn = Rotation.from_rotvec(xi[:3]).as_matrix()
+    return (points - xi[3:]) @ turn
+
+
+def test_of_the_arm_nothing_is_handed_on_that_began_at_a_view(sessions):
+    assert arm_model(model_of(run(sessions[0], effects=["part_slip"]))) is None

@@ -1,8 +1,14 @@
-"""Run folders through their commands: what is written agrees with itself, and nothing stale or half-made stays."""
+"""Run folders through their commands: what is written agrees with itself, and nothing stale or half-made stays.
+
+Where a run may go, and what of the folder there is its own.
+
+A run read back from its folder; the Python file that its model names is run only where somebody allows it.
+"""
 
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,20 +16,28 @@ from pyarrow.parquet import read_table
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.edits import set_cell
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.write import write_session
 from stitch.api import pipeline, stepwise
-from stitch.api.pipeline import run_rig
+from stitch.api.pipeline import change, run, run_rig
+from stitch.api.pipeline import run as stitched
 from stitch.cli.main import main
-from stitch.errors import NoResultError
+from stitch.effects import EFFECTS
+from stitch.errors import InputError, NoResultError
 from stitch.model.model_toml import read_model
 from stitch.numerics import frames
+from stitch.output import run_folder
+from stitch.output.json_file import is_run_file, require_free, sessions_in
+from stitch.output.result_document import model_of
 from stitch.output.run_folder import restore_fit, write_with_page
-from stitch.output.stored_run import diagnosed_state, load_run
+from stitch.output.stored_run import diagnosed_state, load_run, trusted_model
 from stitch.recorder import SilentRecorder
 from stitch.run_data import LedgerStep
 from stitch.session.reading.session_folder import load_session
 from viz import run_page
 from viz.page_parts import sections_of, with_sections
+from viz.run_page import write_report
 
 EFFECT = "scanner_thermal_scale"
 
@@ -284,3 +298,169 @@ def test_residuals_with_gaps_in_the_times_and_covariates_named_like_columns(sess
         own = columns["view"] == view
         for name, value in zip(("time_s", "covariate_residual", "covariate_nx"), known, strict=True):
             assert np.array_equal(np.unique(columns[name][own]), [value], equal_nan=True)
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "session.toml").touch()
+    return tmp_path
+
+
+def make_run(folder, session):
+    folder.mkdir(parents=True)
+    (folder / "result.json").write_text(json.dumps({"format": "stitch-run/1", "session": str(session)}))
+    (folder / "model.toml").touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("target", "expected"),
+    [
+        ("s", "lies in the session"),
+        ("s/runs/a", "lies in the session"),
+        ("link", "lies in the session"),
+        (".", "the session .* lies in it|one stands in"),
+        ("own", "not a run folder"),
+        ("other", "holds the run of .*force=True"),
+        ("model", "not a run folder"),
+        ("damaged", "not a run folder"),
+    ],
+)
+def test_a_place_where_something_would_be_lost_is_refused(place, target, expected):
+    (place / "link").symlink_to(place / "s")
+    for name in ("own", "model", "damaged"):
+        (place / name).mkdir()
+    (place / "own" / "thesis.txt").touch()
+    (place / "model" / "model.toml").touch()
+    (place / "damaged" / "model.toml").touch()
+    (place / "damaged" / "result.json").write_text("[" * 100_000)
+    make_run(place / "other", place / "t")
+    with pytest.raises(InputError, match=expected):
+        require_free(place / target, [place / "s"], force=False)
+
+
+def test_a_run_may_go_where_nothing_would_be_lost(place):
+    (place / "empty").mkdir()
+    make_run(place / "same", place / "s")
+    make_run(place / "other", place / "t")
+    for target in ("new", "empty", "same"):
+        require_free(place / target, [place / "s"], force=False)
+    require_free(place / "other", [place / "s"], force=True)
+
+
+def test_of_a_rig_the_runs_inside_are_its_own(place):
+    """The folder of one run may hold another run of the person's: that is none of its own."""
+    rig, single = place / "rig", make_run(place / "single", place / "s")
+    make_run(rig / "a", place / "a")
+    make_run(rig / "b", place / "b")
+    (rig / "model.toml").touch()
+    make_run(single / "a", place / "a")
+    assert sessions_in(rig) == [str(place / "a"), str(place / "b")]
+    assert is_run_file(rig)(Path("a/result.json")) and not is_run_file(rig)(Path("a/notes.txt"))
+    assert not is_run_file(single)(Path("a/result.json"))
+    is_own = {
+        name: is_run_file(single)(Path(name)) for name in ("result.json", "pictures/budget.png", "pictures/mine.png")
+    }
+    assert is_own == {"result.json": True, "pictures/budget.png": True, "pictures/mine.png": False}
+
+
+def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
+    """One of them is a gross error, and must stay out."""
+    session, *_ = labelled_cell(5, views=24)
+    session.views[7].sighting.points[2] += [3.0, -2.0, 1.0]
+    loaded = load_session(write_labelled(tmp_path / "s", session))
+    found = stitched(loaded, effects=["joint_offset"])
+    assert len(found.outliers) == 1
+    (tmp_path / "r").mkdir()
+    write_with_page(found, tmp_path / "r")
+    again = load_run(tmp_path / "r")
+    for name in ("positions", "orientation"):
+        np.testing.assert_array_equal(getattr(again.targets.landmarks, name), getattr(found.targets.landmarks, name))
+    np.testing.assert_allclose(again.targets.target_rms, found.targets.target_rms, rtol=1e-9)
+    np.testing.assert_array_equal(again.targets.heldout, found.targets.heldout)
+    assert again.targets.rms == pytest.approx(found.residual_rms, rel=1e-9)
+    for same in (again, stitched(loaded, model_of(found))):
+        np.testing.assert_array_equal(same.terms[0].sigmas, found.terms[0].sigmas)
+    # A scatter of the poses that nobody knows is no damage.
+    document = json.loads((tmp_path / "r" / "result.json").read_text())
+    document["repeatability"] = {"rotation": None, "translation": None}
+    (tmp_path / "r" / "result.json").write_text(json.dumps(document))
+    unknown = load_run(tmp_path / "r")
+    assert np.isnan(unknown.repeatability.translation) and np.isnan(unknown.repeatability.rotation)
+    for told, shown in ((again, True), (unknown, False)):
+        write_report(told, tmp_path / "page.html")
+        assert ("Scatter of the robot" in (tmp_path / "page.html").read_text()) == shown
+
+
+EFFECTS_FILE = """
+from pathlib import Path
+from stitch.effects import effect, number
+Path(__file__).with_name("executed").touch()
+
+@effect("sensor", k=number("mm", typical=0.02, limit=1.0))
+def of_a_stranger(points, view, k):
+    "x"
+    return points
+"""
+
+
+@pytest.fixture
+def model(tmp_path):
+    (tmp_path / "sent.py").write_text(EFFECTS_FILE)
+    file = tmp_path / "model.toml"
+    rows = [list(map(float, row)) for row in np.eye(4)]
+    file.write_text(
+        f'format = "stitch-model/1"\nlength_unit = "mm"\nmount = "eye_to_hand"\n'
+        f'effects_file = "{tmp_path / "sent.py"}"\n[hand_eye]\ncorrected = {rows}\n'
+    )
+    yield file
+    EFFECTS.pop("of_a_stranger", None)
+
+
+@pytest.mark.parametrize("whole_folder", [False, True])
+def test_no_file_of_effects_runs_by_itself(model, whole_folder):
+    with pytest.raises(InputError, match=r"names effects in .*sent.py.*--trust.*--effects-file"):
+        trusted_model(model.parent if whole_folder else model)
+    assert not (model.parent / "executed").exists() and "of_a_stranger" not in EFFECTS
+
+
+def test_a_file_of_effects_runs_where_it_is_trusted(model):
+    assert trusted_model(model, trust=True)[1] == str(model.parent / "sent.py")
+    assert "of_a_stranger" in EFFECTS
+
+
+def test_a_file_of_ones_own_takes_its_place(model):
+    own = model.parent / "own.py"
+    own.write_text(EFFECTS_FILE.replace("of_a_stranger", "of_my_own").replace("executed", "mine"))
+    try:
+        assert trusted_model(model, effects_file=own)[1] == str(own)
+        assert "of_my_own" in EFFECTS and not (model.parent / "executed").exists()
+    finally:
+        EFFECTS.pop("of_my_own", None)
+
+
+def test_values_must_be_numbers(model):
+    model.write_text(model.read_text() + '[effects.range_scale.s]\nvalue = nan\nunit = ""\n')
+    with pytest.raises(InputError, match=r"effects.range_scale.s is nan; to fix"):
+        trusted_model(model, trust=True)
+
+
+def test_a_file_is_named_while_an_effect_of_it_is_in_use(tmp_path):
+    """Otherwise a model that needs no Python of anybody would ask for consent to run some."""
+    file, folder = tmp_path / "mine.py", tmp_path / "r"
+    file.write_text(
+        EFFECTS_FILE.replace("of_a_stranger", "of_my_own").replace("return points", "return points * (1 + 1e-3 * k)")
+    )
+    session = load_session(write_labelled(tmp_path / "s", labelled_cell(views=12)[0]))
+    folder.mkdir()
+    try:
+        run_folder.write_with_page(replace(run(session), effects_file=str(file)), folder)
+        assert read_model(folder).effects_file is None
+        for effects in (["of_my_own"], ["of_my_own", "joint_offset"], ["joint_offset"]):
+            run_folder.write_with_page(change(load_run(folder, file), effects), folder)
+            used = "of_my_own" in effects
+            assert read_model(folder).effects_file == (str(file) if used else None)
+    finally:
+        EFFECTS.pop("of_my_own", None)
+    assert load_run(folder).model.effects == ["joint_offset"]

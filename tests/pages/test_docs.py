@@ -1,4 +1,7 @@
-"""The pages say what is there: paths, names, commands, the walk of a cloud, keys, formats, links; benches import what is there."""
+"""The pages say what is there: paths, names, commands, the walk of a cloud, keys, formats, links; benches import what is there.
+
+Blocks of the pages: of a kind that is known, run or left alone for a reason; every command line of `stitch` parses.
+"""
 
 import ast
 import importlib
@@ -7,17 +10,20 @@ import posixpath
 import re
 import sys
 import threading
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 import stitch
 from bench import run as bench_run
-from bench.docs.page_blocks import ROOT, blocks
+from bench.docs.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
 from bench.docs.site_pages import pages
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
 from stitch.api.pipeline import diagnose, run
+from stitch.cli.main import build
 from stitch.output.diagnosis_document import diagnosis_document
 from stitch.output.result_document import ledger, result_document
 from stitch.output.run_folder import write_with_page
@@ -26,7 +32,7 @@ from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.session_folder import load_session
 from stitch.system import threads
 
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+ALL_PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FOLDERS = ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
 # Files of somebody's own, of sessions and of run folders.
 OTHERS = {
@@ -47,6 +53,7 @@ OTHERS = {
 }
 # Words that the glossary replaces.
 PRIVATE = re.compile(r"\bsuspects?\b|look-?alikes?|\bmend(s|ed)?\b|\bgross errors?\b", re.IGNORECASE)
+TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +81,7 @@ def without_blocks(page: Path) -> str:
     return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: page.name)
 def test_every_path_and_link_of_a_page_exists(page, paths):
     named = {path for text in quoted(page) for path in re.findall(r"[\w/-]+\.(?:py|toml)\b", text)}
     gone = [p for p in named if p not in OTHERS and not any(f == p or f.endswith(f"/{p}") for f in paths)]
@@ -83,13 +90,13 @@ def test_every_path_and_link_of_a_page_exists(page, paths):
     assert not [link for link in links if not (page.parent / link).exists()]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: page.name)
 def test_every_name_of_a_page_is_in_the_code(page, code):
     names = [text for text in quoted(page) if re.fullmatch(r"[A-Za-z_][\w.]*(\(\))?", text)]
     assert not [name for name in names if name.rstrip("()").split(".")[-1] not in code]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: page.name)
 def test_pages_use_the_field_s_words(page):
     text = without_blocks(page).split("## How things are said")[0]
     assert not [found.group() for found in PRIVATE.finditer(text)]
@@ -207,6 +214,8 @@ def test_every_key_that_a_run_writes_stands_on_the_page(few_effects):
 
 
 FORMATS_PAGE = ROOT / "docs" / "formats.md"
+
+
 BAGS = (".bag", ".db3", ".mcap")
 
 
@@ -230,6 +239,8 @@ def test_every_row_has_its_tests():
 
 
 OWN = {"stitch", "data_synth", "viz", "bench"}
+
+
 # It needs a package that tests do without.
 NOT_IMPORTED = {"bench.docs.review"}
 
@@ -263,7 +274,7 @@ def test_a_table_of_the_benches_stands_in_its_module(table):
     assert name in {ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", ALL_PAGES, ids=lambda page: page.name)
 def test_a_page_names_tables_of_the_benches_that_are_there(page):
     assert set(re.findall(r"bench/run\.py\s+([a-z][\w-]*)", page.read_text(encoding="utf-8"))) <= set(bench_run.TABLES)
 
@@ -275,3 +286,59 @@ BENCHES = "".join(file.read_text(encoding="utf-8") for file in sorted((ROOT / "b
 def test_a_page_has_the_block_that_a_table_is_written_into(page, block):
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     assert f"<!-- {block}: begin -->" in text and f"<!-- {block}: end -->" in text
+
+
+def forms(page):
+    """Command lines that are not run: in `sh` blocks, and in sentences between backticks."""
+    text = page.read_text(encoding="utf-8")
+    quoted = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    lines = [line for b in blocks(page) if b.language == "sh" for line in b.text.splitlines()]
+    return [line.removeprefix(".venv/bin/") for line in lines], [line.replace("\\|", "|") for line in quoted]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_block_is_of_a_known_kind(page):
+    fences = re.findall(r"^ *```(\w*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert fences[1::2] == [""] * (len(fences) // 2)
+    assert not [language for language in fences[::2] if language not in LANGUAGES], f"one of {LANGUAGES}"
+    # Indented blocks would slip through.
+    assert not re.search(r"^    (stitch|python|make) ", page.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_form_of_a_command_parses(page):
+    wrong, (lines, sentences) = {}, forms(page)
+    for line in (*lines, *sentences):
+        if re.match(r"stitch [a-z-]", line):
+            if why := refused(line, named_only=line in sentences):
+                wrong[line] = why
+        elif target := re.match(r"make (\w+)", line):
+            assert target[1] in TARGETS, line
+        elif module := re.match(r"(?:\.venv/bin/)?python (?:-m )?(bench[\w./]+)", line):
+            path = module[1] if module[1].endswith(".py") else module[1].replace(".", "/") + ".py"
+            assert (ROOT / path).is_file(), line
+    assert not wrong
+
+
+def test_every_command_stands_on_the_page_of_commands():
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    assert not [name for name in typer.main.get_command(build()).commands if f"stitch {name}" not in page]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["stitch nothing", "stitch run --no-such-option", "stitch export", "stitch calibrate globe SESSION", "stitch drop"],
+)
+def test_a_wrong_line_is_refused(line):
+    assert refused(line)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_names_only_what_exists(page):
+    """Without running it, blocks that cannot be run included."""
+    for node in (node for b in blocks(page) if b.language == "python" for node in ast.walk(ast.parse(b.text))):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                assert hasattr(import_module(node.module), alias.name), f"{node.module} has no {alias.name}"
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "stitch":
+            assert node.attr in stitch.__all__

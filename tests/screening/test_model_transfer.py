@@ -1,20 +1,32 @@
-"""The model of another day, and an arm that sessions share: what holds is not doubted, what does not is said or refused."""
+"""The model of another day, and an arm that sessions share: what holds is not doubted, what does not is said or refused.
+
+U of the hand-eye with what the views cannot show, against a fit of hand-eye and all these effects together.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from data_synth.fixtures.blade_cells import captured, measured_blade
+from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.api.pipeline import change, diagnose, run, run_rig
 from stitch.errors import NoResultError
+from stitch.model.model import Model
 from stitch.numerics import frames
+from stitch.observations.surfaces.hand_eye_fit import Repeatability, pose_covariance
+from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.output.comparison.run_verdict import run_light, run_verdict
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import model_of
+from stitch.screening.hand_eye_anywhere import hand_eye_sigma_anywhere
 from stitch.screening.model_transfer import compare_with_own_effects
+from stitch.screening.view_model import UsualEffects, thin_correspondences, view_model
+from stitch.session.measurement import measurement_of, with_part_origin
 
 OFFSETS = np.array([0, 8e-4, -9e-4, 0, 1e-3, 0])
+SCATTER = Repeatability(2e-5, 0.02, 1.0)
 
 
 def seen_by(session, T):
@@ -143,3 +155,46 @@ def test_what_is_significant_is_said_only_where_it_is_large(shared, alone, large
     found = compare_with_own_effects("day 1", shared**2 * squares, alone**2 * squares, 6)
     assert found.p_value < 1e-3 and found.large == large
     assert found.separate_rms < found.expected_rms < 1.01 * found.separate_rms
+
+
+@pytest.fixture(scope="module")
+def ordinary_cell():
+    """What the views of a cell show, its hand-eye as well known as its scatter lets it, and effects that it may have."""
+    measured = measured_blade(22, views=8, pixels=70)
+    capture = captured(measured)
+    measurement = with_part_origin(measurement_of(session_of(measured), capture), measured.T_mount)
+    views = unconstrained_poses(capture, capture.poses(measured.T_mount), 4 * capture.spacing)
+    reduced = view_model(capture, measured.T_mount, views).reduced
+    C = pose_covariance(reduced, SCATTER)
+    model = Model(measured.T_mount)
+    known = np.linalg.inv(reduced.hand_eye.T @ np.linalg.solve(C, reduced.hand_eye))
+    model = replace(model, covariance=known)
+    usual = UsualEffects(measurement, model).by_place(thin_correspondences(views))
+    J = reduced.reduction @ np.hstack([columns for place, columns in usual.items() if place not in ("robot", "links")])
+    return measurement, model, views, reduced.hand_eye, C, J
+
+
+def test_it_is_that_of_a_fit_of_all_effects_in_their_usual_sizes(ordinary_cell):
+    measurement, model, views, A, C, J = ordinary_cell
+    columns = np.hstack([A, J])
+    prior = np.diag([0.0] * 6 + [1.0] * J.shape[1])
+    together = np.linalg.inv(columns.T @ np.linalg.solve(C, columns) + prior)
+    sigma = hand_eye_sigma_anywhere(measurement, model, views, SCATTER)
+    assert sigma == pytest.approx(np.sqrt(np.diag(together))[:6], rel=1e-5)
+    assert (sigma > np.sqrt(np.diag(model.covariance))).all()
+
+
+def test_an_effect_drawn_in_its_usual_size_moves_the_hand_eye_by_no_more_than_it_says(ordinary_cell):
+    """Draws of what no view shows: of the effects, the part that is left once their visible part is known."""
+    measurement, model, views, A, C, J = ordinary_cell
+    rng = np.random.default_rng(0)
+    both = np.hstack([A, J])
+    normal = both.T @ np.linalg.solve(C, both) + np.diag([0.0] * 6 + [1.0] * J.shape[1])
+    errors = []
+    for _ in range(400):
+        effects = rng.standard_normal(J.shape[1])
+        z = J @ effects + np.linalg.cholesky(C) @ rng.standard_normal(len(C))
+        errors.append(np.linalg.solve(normal, both.T @ np.linalg.solve(C, z))[:6])
+    sigma = hand_eye_sigma_anywhere(measurement, model, views, SCATTER)
+    # The scatter of 400 draws is known to 4 %.
+    assert np.abs(np.std(errors, axis=0) / sigma - 1).max() < 0.15

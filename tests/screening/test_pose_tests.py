@@ -1,4 +1,7 @@
-"""Tests of poses against closed forms and a generator of chance whose every size is known, and in whole runs."""
+"""Tests of poses against closed forms and a generator of chance whose every size is known, and in whole runs.
+
+A base that moved is told from an arm that is bad.
+"""
 
 from dataclasses import replace
 
@@ -8,8 +11,10 @@ from scipy import stats
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
+from bench.real_arms import WORLDS, bad_arm
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from stitch.api.pipeline import run
@@ -20,6 +25,7 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.screening import pose_tests
+from stitch.screening.common_move import find_common_move
 from stitch.screening.pose_tests import (
     expected_poses,
     find_blunders,
@@ -28,6 +34,7 @@ from stitch.screening.pose_tests import (
     length_problem,
 )
 from stitch.screening.view_model import projector, test_alternative
+from stitch.session.capture import prepare_capture
 from stitch.session.session import Cloud
 from tests.screening.direct_views import direct_views, with_z
 
@@ -324,3 +331,31 @@ def test_a_view_that_is_off_is_no_factor():
     for seed in range(5):
         model, T = seen_views(seed, 4, displaced=200)
         assert length_problem(model, T, model.columns([1])) is None
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("seed", [40, 41])
+def test_a_bad_arm_is_neither_refused_nor_said_to_have_moved(world, seed):
+    assert bad_arm({"world": world, "times": 0.0, "seed": seed})["found"] == []
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_move_of_eight_times_its_error_is_named_with_the_view(world):
+    assert bad_arm({"world": world, "times": 8.0, "seed": 42})["moved"]
+
+
+@pytest.mark.parametrize(("by", "sure"), [(0.3, True), (0.06, False)])
+def test_a_move_of_the_arms_own_size_is_a_doubt(by, sure):
+    session, *_ = labelled_cell(3, views=60, mount="eye_in_hand")
+    views = list(session.views)
+    for v in range(25, 60):
+        T = np.array(views[v].T_base_flange)
+        T[:3, 3] += [by, 0, 0]
+        views[v] = replace(views[v], T_base_flange=T, joints=None)
+    move = find_common_move(prepare_capture(replace(session, views=tuple(views))))
+    assert move is not None and abs(move.start - 25) <= 1
+    assert move.is_sure == sure and move.moved == pytest.approx(by, abs=0.04)
+
+
+def test_of_few_views_no_move_is_asked():
+    assert find_common_move(prepare_capture(labelled_cell(3, views=7)[0])) is None

@@ -1,21 +1,40 @@
-"""Views that do not belong, in cells of known truth: what links and contradicts them, and where they really stood."""
+"""Views that do not belong, in cells of known truth: what links and contradicts them, and where they really stood.
+
+What happened to views that do not belong, and how that is said: steps, exchanged scans, sizes, lists of names.
+
+Where a scan closes among the others: at places that look alike, and together with its group.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from pykdtree.kdtree import KDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch.numerics import frames
 from stitch.screening.linkage import Link, find_contradicting_views, linkage_of_links
 from stitch.screening.motions import register_scan_pairs
-from stitch.screening.placement import lies_in_a_line
-from stitch.screening.snooping import snoop_views
+from stitch.screening.pairing import exchange_cycles, exchanged_pairs, find_common_displacement
+from stitch.screening.placement import (
+    ReferenceSurface,
+    closed_placements,
+    has_rival,
+    lies_in_a_line,
+    place_groups,
+    place_scan,
+)
+from stitch.screening.problems import SessionProblem, displacement_text, list_views
+from stitch.screening.snooping import MisplacedView, snoop_views
 from stitch.session.scan import prepare_scan
 
 GATE, OFF = 2.5, 6
 POSES = np.tile(np.eye(4), (3, 1, 1))
 TOLERANCE, SIZE = 0.1, 100.0
+SLIP = np.array([0.05, -0.03, 0.02, 3.0, -5.0, 2.0])
+NAMES = [f"v{v:03d}" for v in range(104)]
+PART_SIZE = 120.0
+PLACES_SLIP = np.array([0.004, -0.003, 0.005, 2.0, -2.0, 1.0])
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +175,139 @@ def test_groups_that_stand_apart_do_not_contradict_each_other():
     poses[2] = frames.exp(np.array([0, 0, 0, 0, 0, 3.0]))
     assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE) == (2,)
     assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE, groups=[(0, 1), (2,)]) == ()
+
+
+def standing(view, T):
+    return MisplacedView(view, "displaced", 0.1, 5.0, T)
+
+
+@pytest.mark.parametrize("views", [range(2, 5), range(3)])
+@pytest.mark.parametrize("what", ["part", "scanner"])
+def test_a_common_displacement_is_one_step(blade_capture, what, views):
+    measured, capture = blade_capture
+    poses = capture.poses(measured.T_mount)
+    moved = {v: frames.exp(SLIP) @ poses[v] if what == "part" else poses[v] @ frames.exp(SLIP) for v in views}
+    assert find_common_displacement(capture, poses, [standing(v, T) for v, T in moved.items()]) == (views, what)
+
+
+def test_views_that_go_each_its_own_way_are_no_step(blade_capture):
+    measured, capture = blade_capture
+    poses, rng = capture.poses(measured.T_mount), np.random.default_rng(1)
+    own = [standing(v, frames.exp(rng.normal(0, [0.05] * 3 + [5.0] * 3)) @ poses[v]) for v in (2, 3, 4)]
+    assert find_common_displacement(capture, poses, own) is None
+
+
+def test_two_views_or_views_in_the_middle_are_no_step(blade_capture):
+    measured, capture = blade_capture
+    poses = capture.poses(measured.T_mount)
+    for views in ((3, 4), (1, 2, 3)):
+        assert (
+            find_common_displacement(capture, poses, [standing(v, frames.exp(SLIP) @ poses[v]) for v in views]) is None
+        )
+
+
+def misplaced(*views):
+    return [MisplacedView(v, "displaced", 0.1, 5.0, np.eye(4)) for v in views]
+
+
+def test_scans_in_each_others_rows_are_closed_rounds():
+    assert exchange_cycles({2: 6, 6: 2, 4: None}) == [(2, 6)]
+    assert exchange_cycles({1: 5, 5: 8, 8: 1}) == [(1, 5, 8)]
+
+
+def test_one_of_two_may_show_too_little():
+    assert exchanged_pairs({8: 1, 1: None}, misplaced(1, 8)) == [(8, 1)]
+
+
+def test_a_row_that_two_scans_claim_is_nobodys():
+    assert exchanged_pairs({8: 1, 7: 1, 1: None}, misplaced(1, 7, 8)) == []
+
+
+def test_a_row_whose_own_scan_belongs_is_not_changed():
+    assert exchanged_pairs({8: 1}, misplaced(8)) == []
+
+
+@pytest.mark.parametrize(
+    ("best", "least", "said"),
+    [
+        ((1e-6, 5.002), (0.0, 4.981), "5 mm"),
+        ((0.03, 3.25), (0.002, 1.2), "at least 1.2 mm and 2 mrad"),
+        ((np.radians(109), 50.0), (np.radians(108.6), 17.0), "at least 17 mm and 109°"),
+        ((np.radians(2), 5.0), (np.radians(2), 5.0), "5 mm and 2.0°"),
+        ((1e-5, 0.02), (1e-6, 0.0006), ""),
+    ],
+)
+def test_a_size_is_told_as_far_as_it_is_held(best, least, said):
+    assert displacement_text(best, least, "mm") == said
+
+
+def test_views_in_a_row_are_a_range_and_two_are_not():
+    assert list_views(NAMES[:103], NAMES) == "v000–v102"
+    assert list_views([*NAMES[2:5], *NAMES[7:9], NAMES[20]], NAMES) == "v002–v004, v007, v008, v020"
+
+
+def test_a_row_is_one_of_the_session_and_not_of_the_names():
+    assert list_views(["v1", "v2", "v3"], ["v1", "x", "v2", "v3"]) == "v1, v2, v3"
+
+
+def test_the_rest_of_many_is_counted():
+    assert list_views(NAMES[::2], NAMES) == "v000, v002, v004, v006, v008, v010 … and 46 more"
+    assert list_views([*NAMES[:20:2], *NAMES[50:]], NAMES).endswith("v010 … and 58 more")
+
+
+def test_a_problem_lists_its_views_so():
+    assert (
+        SessionProblem("disconnected", tuple(NAMES[1:]), "add views").line(NAMES)
+        == "disconnected (v001–v103): add views"
+    )
+
+
+def turned(degrees):
+    return frames.exp(np.array([0, 0, np.radians(degrees), 0, 0, 0]))
+
+
+def shown(height, low, high, count):
+    """Points and normals of a wall of radius 50 + height(angle), between two angles in degrees."""
+    rng, step = np.random.default_rng(0), 1e-6
+    angle, z = np.radians(rng.uniform(low, high, count)), rng.uniform(-30, 30, count)
+    around, out = np.array([np.cos(angle), np.sin(angle)]), 50 + height(angle)
+    slope = (height(angle + step) - height(angle - step)) / (2 * step)
+    normal = out * around - slope * np.array([-np.sin(angle), np.cos(angle)])
+    points = np.column_stack([*(out * around), z])
+    return points, np.column_stack([*(normal / np.linalg.norm(normal, axis=0)), 0 * z])
+
+
+@pytest.mark.parametrize(
+    ("height", "alike"),
+    [
+        (lambda t: 1.5 * np.cos(24 * t), True),
+        (lambda t: 8 * np.exp(-(((t - 1.5) / 0.2) ** 2)) + 1.5 * np.cos(3 * t), False),
+    ],
+)
+def test_places_that_are_alike_are_rivals(height, alike):
+    points, normals = shown(height, 0, 180, 12_000)
+    surface = ReferenceSurface(points, normals, KDTree(points), 1.0, 0.3)
+    scan = prepare_scan("view", shown(height, 60, 110, 4_000)[0], eye=np.array([0, 300.0, 0]))
+    found = place_scan(scan, surface, np.array([turned(a) for a in (-30, -15, 0, 15, 30)]), PART_SIZE)
+    closed = closed_placements(scan, found, turned(-95)[None], (0.8, PART_SIZE))
+    assert closed and has_rival(scan, closed[0], closed, PART_SIZE) == alike
+
+
+def test_a_group_moves_back_as_one(blade_capture):
+    measured, capture = blade_capture
+    poses = capture.poses(measured.T_mount)
+    views, half = len(poses), len(poses) // 2
+    apart = poses.copy()
+    apart[half:] = frames.exp(PLACES_SLIP) @ poses[half:]
+    chains = [range(half), range(half, views)]
+    linked = linkage_of_links(views, [Link(v, v + 1, 100, 1.0) for chain in chains for v in chain[:-1]])
+    placed = place_groups(capture, apart, linked, (0.1, 0.7))
+    moved, kept = (placed, set(range(views)) - set(placed))
+    assert set(moved) in (set(chains[0]), set(chains[1]))
+    # One common motion brings them back to the others, which stay where they are.
+    stay = min(kept)
+    G = apart[stay] @ frames.inverse(poses[stay])
+    for v, placement in placed.items():
+        middle = capture.scans[v].points.mean(axis=0)[None]
+        off = frames.transform(placement.T, middle) - frames.transform(G @ poses[v], middle)
+        assert np.linalg.norm(off) < 0.15

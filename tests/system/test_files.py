@@ -1,14 +1,21 @@
-"""A folder is there as it was or as it shall be, and a person's own files outlive every change."""
+"""A folder is there as it was or as it shall be, and a person's own files outlive every change.
+
+Foreign code that does not end.
+"""
 
 import os
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from stitch.errors import InputError
 from stitch.system import files
 from stitch.system.files import claim_folder, only_writer, rewrite_folder
+from stitch.system.time_limit import running_over, time_limit
 
 
 def ours(inside):
@@ -106,7 +113,11 @@ def test_an_end_at_any_moment_of_a_change_in_place_is_made_good(run, monkeypatch
 
 
 WINDOWS = Path(__file__).parents[1] / "as_on_windows.py"
+
+
 HERE_OR_THERE = {"here": "", "windows": f"import runpy; runpy.run_path({str(WINDOWS)!r})['behave_as_windows']()"}
+
+
 HOLDING = """
 import sys, time
 from pathlib import Path
@@ -115,6 +126,8 @@ with only_writer(Path(sys.argv[1]), Path("r")):
     print("held", flush=True)
     time.sleep(float(sys.argv[2]))
 """
+
+
 FILE_IN_USE = """
 import sys
 from pathlib import Path
@@ -158,3 +171,35 @@ def test_a_folder_whose_file_is_in_use_stays_as_it_was_where_it_cannot_move(run,
     assert "used by another process" in said.stdout
     assert contents(run) == before
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def spin(seconds):
+    with time_limit(0.3, "too long"):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            pass
+
+
+@pytest.mark.parametrize("wait", [spin, time.sleep])
+def test_what_takes_too_long_is_interrupted(wait):
+    began = time.monotonic()
+    with pytest.raises(InputError, match="too long"), time_limit(0.3, "too long"):
+        wait(30)
+    assert time.monotonic() - began < 10 and not running_over()
+
+
+def test_a_thread_that_takes_too_long_interrupts_who_waits_for_it():
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(spin, 2)
+        with pytest.raises(InputError, match="too long"):
+            waiting.result()
+        assert running_over()
+    assert not running_over()
+
+
+def test_what_ends_in_time_is_left_alone():
+    with time_limit(0.5, "outer"):
+        with time_limit(0.1, "inner"):
+            pass
+        time.sleep(0.2)
+    time.sleep(0.6)

@@ -1,4 +1,9 @@
-"""What people see: the recording of a small run, and of one to which an effect was added; its page; numbers that agree at every step."""
+"""What people see: the recording of a small run, and of one to which an effect was added; its page; numbers that agree at every step.
+
+What the marks of labelled points stand for, and where they stand.
+
+The machine as a drawing: what errs is marked, and nothing where no arm is known.
+"""
 
 import json
 import re
@@ -11,8 +16,12 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+import stitch
 from data_synth.fixtures.blade_cells import measured_blade
-from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.labelled_arm import PROBE_TURN, TABLE, TARGETS, flange, labelled_cell
+from data_synth.fixtures.quiet_scenes import clean, plan_for
+from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
@@ -23,10 +32,12 @@ from stitch.run_data import Note
 from viz.colours import UNSEEN, signed_colours
 from viz.course_recording import apart, log_course
 from viz.diagnosis_recording import log_diagnosis
+from viz.machine_drawing import machine_svg
 from viz.model_timeline import one_above_the_other
 from viz.page_parts import unbroken
 from viz.rrd_file import RecordingFile
 from viz.run_page import write_report
+from viz.target_scene import ANY, NOTHING, bodies, mark_values, marks_of
 
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -216,3 +227,85 @@ def test_a_real_object_has_a_page_and_a_recording(reghec, name, tmp_path, stitch
     page = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
     shown = json.loads(re.search(r'id="part-data">(.*?)</script>', page, re.S)[1])["steps"]
     assert [(s["name"], s["mean"]) for s in shown] == [(r["step"], pytest.approx(1e3 * r["mean"])) for r in rows]
+
+
+def test_a_mark_counts_what_it_stands_for():
+    view, target, distance = np.array([0, 0, 1, 3]), np.array([0, 2, 2, 0]), np.array([3.0, 4.0, 12.0, 5.0])
+    marks = np.array([(0, 2), (0, ANY), (ANY, 2), (ANY, 0), (3, 0), (2, ANY), (1, 0), (ANY, 1), (NOTHING, NOTHING)])
+    square = [16, (9 + 16) / 2, (16 + 144) / 2, (9 + 25) / 2, 25]
+    expected = np.append(np.sqrt(square), [np.nan] * 4)
+    np.testing.assert_allclose(mark_values(marks, view, target, distance), expected)
+
+
+@pytest.mark.parametrize("kind", ["carried targets", "carried scanner", "probe"])
+def test_marks_stand_where_the_cell_has_them(kind):
+    """By the true cell, whose chain is written down a second time; poses scatter by 20 µm."""
+    mount = "eye_in_hand" if kind == "carried scanner" else "eye_to_hand"
+    session, T_mount, _ = labelled_cell(1, views=12, mount=mount, probe=kind == "probe")
+    marks = marks_of(run(session))
+    joints = np.array([view.joints for view in session.views])
+    T_base_flange = np.array([flange(q) for q in joints])
+    own = marks.view >= 0
+    if mount == "eye_in_hand":
+        expected = (T_base_flange @ T_mount)[marks.view[own], :3, 3]
+        balls = marks.T[marks.target >= 0, :3, 3]
+        np.testing.assert_allclose(balls, TARGETS + TABLE, atol=0.2)
+    else:
+        expected = np.array(
+            [
+                (T_base_flange[v] @ [*TARGETS[k], 1.0])[:3]
+                for v, k in zip(marks.view[own], marks.target[own], strict=True)
+            ]
+        )
+        assert len(expected) == 12 * (1 if kind == "probe" else len(TARGETS))
+    np.testing.assert_allclose(marks.T[own, :3, 3], expected, atol=0.2)
+    if kind == "probe":
+        turned = T_base_flange[marks.view[own], :3, :3] @ PROBE_TURN
+        np.testing.assert_allclose(marks.T[own, :3, :3], turned, atol=1e-3)
+    # All bodies together: every vertex belongs to its mark, and lies near it.
+    surface = bodies(marks)
+    away = np.linalg.norm(surface.vertices - marks.T[surface.patch[:, 0], :3, 3], axis=1)
+    assert away.max() < 0.2 * np.ptp(marks.valued, axis=0).max()
+    assert set(surface.patch[:, 0]) == set(range(len(marks.shape)))
+
+
+@pytest.fixture(scope="module")
+def erring_run():
+    scene = clean("blade", rays=40)
+    planned = plan_for(scene, 2, 6)
+    return stitch.run(session_of(simulate(scene, {}, 2, planned=planned)))
+
+
+def circles(svg):
+    return re.findall(r'<circle [^>]*fill="([^"]*)"', svg)
+
+
+def test_every_joint_is_drawn_and_the_one_that_errs_is_marked_and_moves(erring_run):
+    svg = machine_svg(erring_run, "joint 5")
+    fills = circles(svg)
+    assert len(fills) == erring_run.session.robot.n_joints
+    assert fills.count("var(--best)") == 1 and ">5</text>" in svg
+    assert "stroke-dasharray" in svg.split("<polyline", 2)[2].split("/>")[0]
+
+
+def test_without_a_cause_nothing_is_marked(erring_run):
+    assert "var(--best)" not in machine_svg(erring_run)
+
+
+@pytest.mark.parametrize(
+    "errs, name", [("the scanner's mount", "mount"), ("the scanner", "scanner"), ("the part", "part")]
+)
+def test_mount_scanner_and_part_are_marked_where_they_err(erring_run, errs, name):
+    svg = machine_svg(erring_run, errs)
+    marked = re.search(r'fill="var\(--best\)"/><text[^>]*>(\w+)</text>', svg)
+    assert marked[1] == name
+
+
+def test_everything_lies_within_the_picture(erring_run):
+    points = re.findall(r'points="([^"]*)"', machine_svg(erring_run, "joint 2"))
+    places = np.array([pair.split(",") for line in points for pair in line.split()], float)
+    assert (places > 0).all() and (places < [230, 250]).all()
+
+
+def test_without_an_arm_there_is_no_drawing(erring_run):
+    assert machine_svg(replace(erring_run, session=replace(erring_run.session, robot=None))) == ""

@@ -1,7 +1,13 @@
-"""A formula is found where there is one, tested in views that took no part, and written as a file of effects."""
+"""A formula is found where there is one, tested in views that took no part, and written as a file of effects.
+
+What is told of a formula and its file: lengths in mm in any session, and what its code reads of the views.
+
+Teeth of a belt and springs that stiffen: found as what they are, of as few numbers as they have.
+"""
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,16 +18,21 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api.pipeline import run
 from stitch.cli.main import main
 from stitch.diagnosis.diagnose import linear_model_of
+from stitch.effects.contract import EFFECTS, missing_need
 from stitch.effects.user_file import load
 from stitch.numerics import frames
-from stitch.plugins.explain.dictionary import build_dictionary
+from stitch.plugins.explain.dictionary import Ingredient, build_dictionary, coefficient
 from stitch.plugins.explain.explain import explain
-from stitch.plugins.explain.quantities import backlash_lag, view_quantities
+from stitch.plugins.explain.formula_file import effect_source, formula_text
+from stitch.plugins.explain.quantities import Quantity, backlash_lag, nonlinear_torque, saw_of_joint, view_quantities
 from stitch.plugins.explain.search import search_sums
 from stitch.session.measurement import views_of
+from stitch.session.torques import no_torques
 from tests.diagnosis.freed_blade import freed_blade
 
 SIZE = 3e-4  # rad
+SHIFT = 8e-5  # m, where the payload is largest
+TOOTH, HEIGHT = 0.33, 8e-4  # rad
 
 
 def coupling(q):
@@ -134,6 +145,8 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeyp
 
 
 VIEWS = 18
+
+
 # Of the flange in its own frame, rad and mm.
 DIRECTION = np.array([2.2e-4, -1.5e-4, 2.8e-4, 0.08, 0.05, -0.07])
 
@@ -206,3 +219,110 @@ def test_of_few_sightings_nothing_is_said(views):
 
 def test_three_views_of_either_half_may_say_something():
     assert explain(evidence(1, coupling, views=6)).why.startswith("No formula holds")
+
+
+def measured_views(count=12):
+    """With all that a session may know of its views."""
+    session, *_ = labelled_cell(3, views=count, payload=np.linspace(1, 4, count))
+    views = views_of(session)
+    turning = np.gradient(views.joints, axis=0)
+    return replace(views, time=np.arange(count) * 60.0, velocity=turning)
+
+
+def loaded(source, tmp_path):
+    (tmp_path / "mine.py").write_text(source, encoding="utf-8")
+    load(tmp_path / "mine.py")
+    return EFFECTS["explained"]
+
+
+@pytest.mark.parametrize(("unit", "size"), [("m", SHIFT), ("mm", 1e3 * SHIFT)])
+def test_a_displacement_is_told_in_mm_whatever_the_session_is_in(unit, size, tmp_path):
+    payload = next(q for q in view_quantities(measured_views()) if q.text == "payload_kg")
+    own = [Ingredient("part", axis, payload) for axis in (0, 3)]
+    values = [coefficient(i, x, unit) for i, x in zip(own, (3e-4, size), strict=True)]
+    text = formula_text(own, values)
+    # The payload grows by 3 kg.
+    assert text == "part rx, tx = (+0.0001) rad/(payload_kg), (+0.027) mm/(payload_kg) · payload_kg"
+    parameters = loaded(effect_source("explained", own, values, text), tmp_path).parameters(6, (), unit)
+    assert parameters[1].typical == pytest.approx(size / 3, rel=0.02)
+
+
+def test_quantities_read_no_more_of_the_views_than_they_say():
+    whole, seen = measured_views(), set()
+    for quantity in view_quantities(whole):
+        own, has = quantity.needs, set(quantity.needs)
+        bare = replace(
+            whole,
+            **{} if "joints" in has else dict.fromkeys(("joints", "previous", "approach", "path")),
+            time=whole.time if "time" in has else None,
+            velocity=whole.velocity if "velocity" in has else None,
+            torques=whole.torques if "torque" in has else no_torques(whole.count),
+            covariates={name: course for name, course in whole.covariates.items() if name in has},
+        )
+        values = eval(quantity.code, {"np": np, "views": bare})
+        np.testing.assert_allclose(values, quantity.values, rtol=1e-5, atol=1e-7, err_msg=f"{quantity.text} {own}")
+        seen |= has
+    assert seen == {"joints", "time", "velocity", "torque", "payload_kg"}
+
+
+@pytest.mark.parametrize(("place", "written"), [("part", '("payload_kg",)'), ("robot", '("joints", "payload_kg")')])
+def test_a_file_that_reads_a_column_is_not_asked_where_there_is_none(place, written, tmp_path):
+    found = {q.text: q for q in view_quantities(measured_views())}
+    followed = found["payload_kg"] if place == "part" else found["sin q2"].times(found["payload_kg"])
+    source = effect_source("explained", [Ingredient(place, 1, followed)], [1e-4], "Found.")
+    assert f"needs={written}," in source
+    effect = loaded(source, tmp_path)
+    assert missing_need(evidence(1, views=8).measurement, effect) == ("payload_kg",)
+    assert not missing_need(evidence(1, views=8, payload=np.linspace(1, 4, 8)).measurement, effect)
+
+
+def belt(q):
+    """Joint 3 creeps by `HEIGHT` along each tooth and jumps back."""
+    teeth = q[2] / TOOTH + 0.3
+    return HEIGHT * np.array([0, 0, teeth - np.floor(teeth) - 0.5, 0, 0, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [40, 80])
+def test_a_belt_that_jumps_is_found_with_its_tooth(views):
+    session, *_ = labelled_cell(1, views=views, targets=TARGETS[:2], gears=belt)
+    found = explain(linear_model_of(run(session)))
+    assert found.found and found.formula.startswith("q*3 = q3")
+    (saw,) = re.findall(r"([-+0-9.e]+) rad · saw of q\d, a tooth ([0-9.]+)°", found.formula)
+    size, tooth = map(float, saw)
+    assert size == pytest.approx(HEIGHT, rel=0.1) and np.radians(tooth) == pytest.approx(TOOTH, rel=0.02)
+
+
+def test_a_saw_jumps_where_it_says_and_belongs_to_its_own_joint():
+    views = views_of(labelled_cell(3, views=12)[0])
+    saw = saw_of_joint(views, 1, 0.2, 0.05)
+    at_jump = saw_of_joint(views, 1, 0.2, float(views.joints[4, 1]))
+    assert abs(at_jump.values[4]) == pytest.approx(0.5)
+    assert saw_of_joint(views, 1, 0.2, 0.05 + 3 * 0.2).text == saw.text
+    slope = np.diff(saw.values) - np.diff(views.joints[:, 1]) / 0.2
+    np.testing.assert_allclose(slope, np.round(slope), atol=1e-9)  # whole teeth are jumped over
+    assert {q.joint for q in view_quantities(views) if q.kind == "teeth"} <= set(range(6))
+    linear = linear_model_of(run(labelled_cell(3, views=12)[0]))
+    of_teeth = [i for i in build_dictionary(linear, view_quantities(views)).ingredients if i.quantity.kind == "teeth"]
+    assert of_teeth and all(i.index == i.quantity.joint for i in of_teeth)
+
+
+@pytest.mark.parametrize("torque", [np.linspace(570, 612, 18), np.linspace(-5, 7, 18)], ids=["far from 0", "about 0"])
+def test_what_no_line_does_is_left_of_a_power(torque):
+    """Far from zero a cube is nearly a line: as it stands nothing of it would count as its own."""
+    cube = cube_of(torque)
+    beside = np.vander(torque - torque.mean(), 2)
+    shares = beside.T @ cube.values / np.linalg.norm(beside, axis=0) / np.linalg.norm(cube.values)
+    np.testing.assert_allclose(shares, 0, atol=1e-6)
+    np.testing.assert_allclose(eval(cube.code, {"torque": torque}), cube.values, atol=1e-6 * np.abs(cube.values).max())
+    step = (torque[1] - torque[0]) / float(f"{np.abs(torque).max():.3g}")
+    np.testing.assert_allclose(np.diff(cube.values, 3), 6 * step**3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("torque", [np.repeat([570.0, 612.0], 6), 600 + np.linspace(0, 1e-6, 12)])
+def test_of_few_torques_or_hardly_different_ones_nothing_is_left_but_rounding(torque):
+    assert cube_of(torque) is None
+
+
+def cube_of(torque):
+    return nonlinear_torque(Quantity("τ", "torque", "N m", "torque", 2, torque), lambda x: x**3, "x³", "x**3")

@@ -1,4 +1,7 @@
-"""Robot programs: targets moved and compensated, everything else to the letter."""
+"""Robot programs: targets moved and compensated, everything else to the letter.
+
+Programs that drive to proposed views, read back by the readers of the controllers' own files.
+"""
 
 import json
 import re
@@ -19,6 +22,8 @@ from stitch.cli.main import main
 from stitch.effects import EFFECTS
 from stitch.errors import InputError, NoResultError
 from stitch.model.model import Term
+from stitch.numerics import frames
+from stitch.plugins.export.next_program import next_program
 from stitch.plugins.export.robot_program import compensate_targets, compensated_program, compensated_texts
 from stitch.plugins.intake.controllers.program import import_file, read_program
 from stitch.plugins.intake.controllers.taught_points import program_bytes
@@ -39,6 +44,14 @@ FRAME[:3, :3], FRAME[:3, 3] = Rotation.from_euler("z", 35, degrees=True).as_matr
 REACH = 2500.0
 ZERO = {"kuka": "0,0,0,0,0,0", "fanuc": "0,0,0,0,0,0", "abb": "0,0,0,1,0,0,0", "ur": "0,0,0,0,0,0"}
 SAMPLES = [("a.ls", FANUC), ("a.dat", KUKA_DAT), ("a.mod", ABB), ("a.script", UR)]
+ROWS = [[-1.25, -68.5, 111.0, 69.125, 67.0, 6.5], [10.0, -70.0, 100.0, -30.0, 55.5, 170.25]]
+POSES = np.array(
+    [
+        frames.exp(np.array([0.3, -1.1, 0.4, 900.0, -120.5, 640.25])),
+        frames.exp(np.array([0, 0, 1.0, 1.0, 2.0, 3.0])),
+    ]
+)
+ABOUT = "Drives to the view that decides between gear_eccentricity and gear_harmonic."
 
 
 def arm_with(name, p, sigma=float("nan")):
@@ -75,6 +88,8 @@ def reached(name, p, read):
 
 # One that moves joints by torque, one by direction, one that changes the links; the others in `make check`.
 LAWS = ["joint_compliance", "backlash", "link_geometry"]
+
+
 LAWS += [
     pytest.param(name, marks=pytest.mark.slow)
     for name in ("joint_offset", "gear_eccentricity", "gear_harmonic", "settling")
@@ -350,7 +365,11 @@ LIN {X 2300.5, Y -120.0, Z 900.25, A 10.0, B -20.0, C 170.0} C_DIS ; in front
 LIN {X 2310.0, Y -20.0, Z 900.0, A 12.0, B -21.0, C 171.0}
 END
 """
+
+
 MOD = "MODULE m\n  CONST robtarget p:=[[100,200,300],[0.5,0.5,0.5,0.5],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
+
+
 MOD += "  PROC main()\n    MoveL p,v100,fine,grip\\WObj:=rack;\n  ENDPROC\nENDMODULE\n"
 
 
@@ -424,3 +443,51 @@ def test_what_cannot_follow_is_refused(tmp_path, capsys, changed, program, more,
     told = fit_json(tmp_path, **changed), "--program", tmp_path / "place.src", "-o", tmp_path / "o.src"
     assert export(*told, "--frame", "0,0,0,0,0,0", *more) == 2
     assert message in " ".join(capsys.readouterr().err.split()) and not (tmp_path / "o.src").exists()
+
+
+@pytest.mark.parametrize("ending", [".src", ".mod", ".ls", ".script"])
+def test_a_joint_program_is_read_back_with_the_angles_that_were_written(tmp_path, ending):
+    file = tmp_path / f"next{ending}"
+    text = next_program(file, ROWS, POSES, ABOUT, j3="own")
+    file.write_bytes(text.encode())
+    points = read_program(file).points
+    read = np.degrees([point.joints for point in points])
+    np.testing.assert_allclose(read, ROWS, atol=6e-4)
+
+
+def test_a_yaskawa_job_is_read_back_with_the_flange_in_the_base(tmp_path):
+    file = tmp_path / "next.jbi"
+    file.write_bytes(next_program(file, ROWS, POSES, ABOUT).encode())
+    points = read_program(file).points
+    read = np.array([point.T_frame_tool for point in points])
+    np.testing.assert_allclose(read, POSES, atol=6e-4)
+
+
+@pytest.mark.parametrize("ending", [".src", ".mod", ".ls", ".script", ".jbi"])
+def test_every_program_says_that_it_has_to_be_checked_and_stops_at_each_view(ending, tmp_path):
+    text = next_program(tmp_path / f"next{ending}", ROWS, POSES, ABOUT, j3="own")
+    told = " ".join(line.split("!")[-1].rstrip(" ;") for line in text.splitlines())
+    assert "reduced speed" in told
+    stops = {".src": "HALT", ".mod": "Stop;", ".ls": "PAUSE ;", ".script": "popup(", ".jbi": "PAUSE"}
+    assert text.count(stops[ending]) == len(ROWS)
+
+
+def test_the_joints_of_a_fanuc_count_from_the_horizontal(tmp_path):
+    file = tmp_path / "next.ls"
+    with pytest.raises(InputError, match=r"--j3 j2\+j3"):
+        next_program(file, ROWS, POSES, ABOUT)
+    file.write_text(next_program(file, ROWS, POSES, ABOUT, j3="j2+j3"))
+    read = np.degrees([point.joints for point in read_program(file).points])
+    np.testing.assert_allclose(read[:, 2], [q[2] - q[1] for q in ROWS], atol=6e-4)
+
+
+def test_an_ending_that_no_controller_has_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"\.src, \.mod, \.ls, \.script, \.jbi"):
+        next_program(tmp_path / "next.txt", ROWS, POSES, ABOUT)
+
+
+def test_a_job_in_pulses_is_refused_with_its_line(tmp_path):
+    file = tmp_path / "old.jbi"
+    file.write_text("/JOB\n//NAME A\n//POS\n///POSTYPE PULSE\n///PULSE\nC00000=1,2,3,4,5,6\n//INST\n")
+    with pytest.raises(InputError, match="line 6: C00000 is in pulses"):
+        read_program(file)

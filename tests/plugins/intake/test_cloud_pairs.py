@@ -1,14 +1,28 @@
-"""Clouds and poses find each other by name, by time, by number, by order."""
+"""Clouds and poses find each other by name, by time, by number, by order.
+
+Rows of a recording that belong to scans, by clocks that differ.
+
+Motions of the scanner from targets that two views share.
+"""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
+from stitch.numerics import frames
 from stitch.plugins.intake.cloud_pairs import clouds_served, pairings
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import StatedTable
+from stitch.plugins.intake.scan_targets import target_motions
+from stitch.plugins.intake.stops import rows_with_scans
+from stitch.session.session import Sighting
 
 CLOUDS = [Path(f"scans/view_{i:02d}.ply") for i in (1, 2, 3, 10)]
+BEGIN = 1.7e9
+FLAT = np.array([[0.0, 0, 0], [100, 0, 0], [100, 70, 0], [0, 70, 0], [50, 30, 0]])
 
 
 @pytest.mark.parametrize(
@@ -103,3 +117,58 @@ def test_names_that_pair_most_clouds_tell():
 @pytest.mark.parametrize(("rows", "served"), [(1, 0), (3, 3), (5, 4), (4, 4), (400, 3)])
 def test_a_list_serves_the_clouds_that_it_can_be_paired_with(rows, served):
     assert min(clouds_served(CLOUDS, [()] * rows), 4) == served
+
+
+@pytest.mark.parametrize("offset", [0.0, 2.6, -3.1])
+def test_one_offset_of_the_clocks_puts_every_scan_into_a_rest_of_the_arm(offset):
+    random = np.random.default_rng(3)
+    places = random.uniform(300, 900, (9, 3))
+    times = BEGIN + np.arange(0, 80, 0.5)
+    # Six seconds of rest, four of motion.
+    step = np.clip((times - BEGIN) % 10 - 6, 0, None)[:, None] / 4
+    stop = ((times - BEGIN) // 10).astype(int)
+    positions = places[stop] * (1 - step) + places[stop + 1] * step
+    numbers = np.column_stack([times, positions, np.tile([0, 0, 0, 1.0], (len(times), 1))])
+    header = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
+    raw = RawPoses("log.csv", header, numbers, ((),) * len(times), "")
+    taken = BEGIN + 10 * np.arange(8) + 3 + random.uniform(-2, 2, 8)
+    clouds = [Path(f"scan_{time + offset:.3f}.ply") for time in taken]
+    rows = rows_with_scans(raw, clouds, None, StatedTable())
+    if not offset:
+        assert rows is raw
+    else:
+        assert "clock of the scans" in rows.words
+        assert np.allclose(rows.numbers[:, 1:4], places[:8])
+
+
+def sighting(T_scanner_part, points, names=None):
+    names = tuple(f"t{i}" for i in range(len(points))) if names is None else names
+    return Sighting(names, frames.transform(T_scanner_part, points), np.full(len(points), 0.01))
+
+
+@pytest.fixture
+def poses():
+    rng = np.random.default_rng(0)
+    return frames.make(Rotation.from_rotvec(rng.normal(0, 0.5, (3, 3))).as_matrix(), rng.normal(0, 100, (3, 3)))
+
+
+def test_points_of_a_plane_give_the_motions(poses):
+    found = target_motions([sighting(T, FLAT) for T in poses])
+    assert found.pairs == ((0, 1), (0, 2), (1, 2))
+    for (v, w), T in zip(found.pairs, found.T, strict=True):
+        assert np.allclose(T, poses[v] @ frames.inverse(poses[w]), atol=1e-9)
+
+
+def test_names_pair_them_whatever_their_order(poses):
+    order = [4, 2, 0, 1]
+    second = sighting(poses[1], FLAT[order], tuple(f"t{i}" for i in order))
+    found = target_motions([sighting(poses[0], FLAT), second])
+    assert np.allclose(found.T[0], poses[0] @ frames.inverse(poses[1]), atol=1e-9)
+
+
+def test_points_in_one_line_or_too_few_say_nothing(poses):
+    line = np.outer(np.arange(5.0), [10, 20, 5])
+    assert not target_motions([sighting(T, line) for T in poses]).pairs
+    assert not target_motions([sighting(T, FLAT[:2]) for T in poses]).pairs
+    others = sighting(poses[1], FLAT, tuple("abcde"))
+    assert not target_motions([sighting(poses[0], FLAT), others]).pairs

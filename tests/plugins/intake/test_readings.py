@@ -1,6 +1,10 @@
 """Every order of Euler angles against products of turns about one axis, written out here.
 
 Joint angles become poses by a URDF that lies beside them; judged by what the simulated arm reported.
+
+Units of positions and clouds by their sizes, and positions of a site.
+
+Poses that are no matrices are read as a table of them is, or refused in the same words.
 """
 
 import csv
@@ -13,7 +17,7 @@ from data_synth.write import write_session
 from stitch.errors import InputError
 from stitch.output.urdf_file import to_urdf
 from stitch.plugins.intake.first_session import first_session
-from stitch.plugins.intake.layouts import ColumnLayout
+from stitch.plugins.intake.layouts import ColumnLayout, possible_layouts, unit_pairs
 from stitch.plugins.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.plugins.intake.readings import (
     StatedTable,
@@ -25,7 +29,11 @@ from stitch.plugins.intake.readings import (
 )
 from stitch.plugins.intake.session_draft import write_draft
 from stitch.plugins.intake.stated_folder import StatedFolder
+from stitch.plugins.intake.stated_poses import matrices_of_table
 from stitch.session.reading.session_folder import load_session
+
+CLOUD = np.random.default_rng(0).uniform(-0.07, 0.07, (500, 3)) + np.array([0, 0, 0.42])  # m
+REACH = np.array([[0.54, 0.21, 0.71], [0.9, -0.1, 0.7]])  # m
 
 
 def turn(axis, angle):
@@ -39,6 +47,8 @@ def turn(axis, angle):
 
 
 ANGLES = np.array([[0.3, -0.8, 1.9], [-2.0, 0.4, 0.7]])
+
+
 EULER = [word for word in rotation_conventions() if word.endswith(("intrinsic", "extrinsic"))]
 
 
@@ -138,3 +148,70 @@ def test_joints_beside_poses_are_counted_as_the_poses_turn(cell, sign, words):
     found = with_uncoupled_joints(reading, raw / "arm.urdf").layout
     assert np.allclose(found.joints, [view.joints for view in session.views]) and words in found.words
     assert bool(words) == ("turns as the poses" in found.words)
+
+
+@pytest.mark.parametrize(
+    ("poses", "clouds", "first"),
+    [
+        (1e3, 1e3, ("mm", "mm")),
+        (1.0, 1.0, ("m", "m")),
+        (1e3, 1.0, ("mm", "m")),
+        (1e3, 1e2, ("mm", "cm")),
+        (1 / 0.0254, 1 / 0.0254, ("inch", "inch")),
+    ],
+)
+def test_units_are_those_of_a_usual_cell_under_which_the_motions_agree(poses, clouds, first):
+    pairs = unit_pairs(REACH * poses, [CLOUD * clouds], poses / clouds)
+    assert pairs[0] == first
+    # A scale that is common to both is told by the usual size alone: cm compete with inches.
+    assert (("cm", "cm") in pairs) == (first == ("inch", "inch"))
+
+
+def test_what_all_positions_of_a_site_have_in_common_is_taken_off():
+    site = np.array([403512.0, 5715430.0, 118.0])
+    table = np.hstack([REACH + site, np.tile([0, 0, 0, 1.0], (2, 1))])
+    header = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    (layout,) = possible_layouts(RawPoses("poses.csv", header, table, ((),) * 2, ""))
+    assert np.abs(layout.position + layout.offset - table[:, :3]).max() < 1e-9
+    assert np.abs(layout.position).max() < 2.0
+    (near,) = possible_layouts(RawPoses("poses.csv", header, table - np.r_[site, np.zeros(4)], ((),) * 2, ""))
+    assert near.offset == () and np.array_equal(near.position, table[:, :3] - site)
+
+
+@pytest.fixture
+def views(session):
+    """Poses (V, 4, 4) mm and scans of a simulated cell, and its mount."""
+    loaded = load_session(session)
+    scale = {"mm": 1.0, "m": 1e3}[loaded.length_unit]
+    T = np.array([view.T_base_flange for view in loaded.views])
+    T[:, :3, 3] *= scale
+    return T, [view.cloud.points * scale for view in loaded.views], loaded.mount
+
+
+def test_quaternions_are_read_as_a_table_of_them(views):
+    T, scans, mount = views
+    rows = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+    read = matrices_of_table(rows, scans, "mm", "mm", mount)
+    assert np.abs(read - T).max() < 1e-9
+
+
+@pytest.mark.parametrize("height", [3, 4])
+def test_matrices_in_one_row_are_read(views, height):
+    T, scans, mount = views
+    assert np.abs(matrices_of_table(T[:, :height].reshape(len(T), -1), scans, "mm", "mm", mount) - T).max() < 1e-9
+    assert np.abs(matrices_of_table(T[:, :3], scans, "mm", "mm", mount) - T).max() < 1e-9
+
+
+def test_what_is_no_table_stays_as_it_is(views):
+    T, scans, mount = views
+    for poses in (T, None, (Rotation.from_matrix(T[:, :3, :3]), T[:, :3, 3]), list(T)):
+        assert matrices_of_table(poses, scans, "mm", "mm", mount) is poses
+
+
+def test_angles_without_scans_that_tell_their_order_are_refused(views):
+    T, _, mount = views
+    rows = np.hstack([T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)])
+    with pytest.raises(InputError, match=r"can be read in \d+ ways; to fix: pass matrices"):
+        matrices_of_table(rows, [None] * len(T), "mm", "mm", mount)
+    with pytest.raises(InputError, match="hold no pose that is known"):
+        matrices_of_table(np.hstack([rows, rows[:, :2]]), [None] * len(T), "mm", "mm", mount)

@@ -1,6 +1,12 @@
-"""An arm's own errors as DH rows, URDF and files."""
+"""An arm's own errors as DH rows, URDF and files.
+
+The calibrated arm as DH rows and URDF against a chain written out by hand.
+
+An arm's model on another day: what holds there stays, what makes it worse is taken out or refused.
+"""
 
 import json
+import tomllib
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
@@ -8,16 +14,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.api.pipeline import run
+from data_synth.fixtures.true_arm import drawn, true_flanges
+from data_synth.write import robot_table
+from stitch.api.pipeline import change, run
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
+from stitch.errors import InputError
 from stitch.model.forward import corrected_capture
-from stitch.model.model import term_of
+from stitch.model.model import Term, term_of
+from stitch.model.model_toml import arm_model
+from stitch.output.result_document import model_of
 from stitch.output.session_files import dh_rows
 from stitch.output.urdf_file import to_urdf
+from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, ArmModel
 from stitch.plugins.metrology.calibrate.command import show_robot
+from stitch.plugins.metrology.calibrate.other_sessions import UNASKED, keep_what_holds, prove, require_held
 from stitch.plugins.metrology.calibrate.robot import (
     LinkTable,
     calibrated_robot_of_run,
@@ -34,6 +48,11 @@ from stitch.session.session import StatedRepeatability
 
 OFFSET = np.array([0, 1.2e-3, -1.5e-3, 0, 1e-3, 0])
 SAG = 1.5e-6  # rad/mm: gravity, which no table holds
+ARM = ARMS["ABB IRB 120"]
+TABLE = robot_table(ARM)
+ROBOT = robot_from_dh("IRB 120", "standard", TABLE["joints"], None, np.array(TABLE["gravity"]), "mm")
+JOINTS = np.random.default_rng(2).uniform(-1, 1, (4, 6))
+GEARS = np.array([0, 8e-4, 8e-4, 0, 0, 0])
 
 
 def rms_with(robot, seed, **arm):
@@ -217,3 +236,122 @@ def test_what_was_found_and_not_proved_is_named(tmp_path, capsys):
     assert "no other effect" not in text and "Take x" not in text
     assert "The model has no other effect of the arm." in written(session, tmp_path / "proved")[1]
     assert robot_document(found, LinkTable(session.robot, ()), [], "")["unproved"] == ["joint_offset"]
+
+
+def arm_with(*names):
+    terms, told = [], {}
+    for i, name in enumerate(names):
+        told[name] = drawn(name, ARM, JOINTS, seed=i)
+        own = EFFECTS[name].parameters(6, tuple("123456"), "mm")
+        terms.append(Term(EFFECTS[name], own).at(np.array([told[name].get(p.name, 0.0) for p in own])))
+    return ArmModel("cell", ROBOT, tuple(terms), "mm", JOINTS), told
+
+
+def product(rows, joints):
+    """Standard DH, multiplied out."""
+    T = np.eye(4)
+    for row, q in zip(rows, joints, strict=True):
+        angle, alpha = q + np.radians(row["theta_deg"]), np.radians(row["alpha_deg"])
+        c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
+        a, d = row["a"], row["d"]
+        T = T @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
+    return T
+
+
+@pytest.mark.parametrize("name", ["joint_offset", "link_geometry"])
+def test_rows_put_the_flange_where_nature_does(name):
+    arm, told = arm_with(name)
+    rows = tomllib.loads(ARM_FORMATS["arm-dh"](arm))["robot"]["joints"]
+    nature = true_flanges(name, told[name], ARM, JOINTS)
+    assert np.array([product(rows, q) for q in JOINTS]) == pytest.approx(nature, abs=1e-9)
+
+
+def test_urdf_puts_the_flange_where_nature_does(tmp_path):
+    yourdfpy = pytest.importorskip("yourdfpy")
+    arm, told = arm_with("link_geometry")
+    (tmp_path / "arm.urdf").write_text(ARM_FORMATS["arm-urdf"](arm), encoding="utf-8")
+    robot = yourdfpy.URDF.load(str(tmp_path / "arm.urdf"))
+    for q, T in zip(JOINTS, true_flanges("link_geometry", told["link_geometry"], ARM, JOINTS), strict=True):
+        robot.update_cfg(q)
+        T[:3, 3] /= 1000
+        assert robot.get_transform("flange", "base_link") == pytest.approx(T, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ARM_FORMATS)
+def test_what_no_table_of_links_can_hold_is_said(kind):
+    arm, _ = arm_with("joint_offset", "gear_eccentricity")
+    assert "Not in it, because no table of links can hold it: gear_eccentricity" in ARM_FORMATS[kind](arm)
+
+
+def of_one_day(q):
+    """An error of gears of joints 2 and 3 that the other day has not."""
+    return GEARS * np.sin(q)
+
+
+@pytest.fixture(scope="module")
+def days():
+    """The arm that is off in its zeros on both days, and in its gears on the first alone."""
+    return labelled_cell(31, views=60, offset=OFFSET, gears=of_one_day)[0], labelled_cell(32, views=60, offset=OFFSET)[
+        0
+    ]
+
+
+@pytest.fixture(scope="module")
+def calibrated(days):
+    return change(run(days[0]), ["joint_offset", "gear_eccentricity"])
+
+
+def test_what_holds_on_both_days_stays_and_the_rest_is_fitted_without_the_other(days, calibrated):
+    proved = keep_what_holds(calibrated, [days[1]])
+    assert proved.run.effects == ["joint_offset"]
+    (taken_out,) = proved.taken_out
+    assert taken_out.startswith("Taken out: gear_eccentricity, which holds on cell alone")
+    (proof,) = proved.proofs
+    assert not proof.worse and proof.rms < 0.7 * proof.nominal_rms
+    # By itself: the other day run with that arm, and without one.
+    assert run(days[1], arm=arm_model(model_of(proved.run))).residual_rms == pytest.approx(proof.rms, rel=0.1)
+    assert run(days[1]).residual_rms == pytest.approx(proof.nominal_rms, rel=0.1)
+
+
+def test_a_right_arm_keeps_its_effects(days):
+    here, there = labelled_cell(33, views=60, offset=OFFSET)[0], days[1]
+    proved = keep_what_holds(change(run(here), ["joint_offset"]), [there])
+    assert proved.run.effects == ["joint_offset"] and not proved.taken_out
+
+
+def test_an_arm_that_makes_another_day_worse_is_refused(days):
+    wrong = arm_model(model_of(change(run(labelled_cell(34, 60, gears=of_one_day)[0]), ["gear_eccentricity"])))
+    right = labelled_cell(35, views=60)[0]
+    assert prove(wrong, [right])[0].worse
+    with pytest.raises(InputError, match="makes another session worse.*calibrate robot SESSION --on cell"):
+        require_held(wrong, [right])
+
+
+def test_nothing_is_claimed_of_other_days_where_none_was_asked(calibrated):
+    proved = keep_what_holds(calibrated, [])
+    assert proved.run is calibrated and proved.sentences == [UNASKED]
+
+
+def test_a_table_that_is_worse_on_another_day_is_not_written():
+    """Calibrated with zeros that were set anew before the other day."""
+    here, there = labelled_cell(36, views=80, offset=OFFSET)[0], labelled_cell(37, views=60)[0]
+    assert link_table(here).effects
+    table = link_table(here, [there])
+    assert not table.effects and table.robot is here.robot
+    assert table.sentence("mm").startswith("The best table leaves")
+
+
+def test_the_command_says_what_was_proved_where(tmp_path, capsys, days):
+    for name, seed in (("monday", 41), ("tuesday", 42)):
+        write_labelled(tmp_path / name, labelled_cell(seed, views=40, offset=OFFSET)[0])
+    arguments = ["calibrate", "robot", str(tmp_path / "monday"), "--on", str(tmp_path / "tuesday"), "-o"]
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments, str(tmp_path / "arm")])
+    assert not stop.value.code
+    said = " ".join("".join(capsys.readouterr()).split())
+    assert "On session tuesday, which took no part, it leaves" in said
+    assert "The model: On session tuesday" in (tmp_path / "arm" / "robot.toml").read_text()
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(tmp_path / "arm"), "--to", "arm-dh", "--on", str(tmp_path / "tuesday")])
+    assert not stop.value.code
+    assert "On session tuesday" in " ".join("".join(capsys.readouterr()).split())
