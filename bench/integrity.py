@@ -3,9 +3,8 @@ any.
 
 GOOD: sessions without a mistake, some with an effect that a model may lack, some whose joints err anew in every view
 (`--only "joints scatter"`). MISTAKES: each mistake of `mistakes` in every cell, of which `--set every=N` takes every
-N-th in a cell, another in the next. MANY: a third of the views and more are wrong. MEASURED: mistakes in the
-conventions of measured scans (folder `reghec` of the shared data), which are run too. Seeds 0 to 99 were used while the
-checks were written, 1000 and above are run once.
+N-th in a cell, another in the next. Seeds 0 to 99 were used while the checks were
+written, 1000 and above are run once.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.harness import SHARED_DATA, Row, Table, grouped, markdown, with_all
+from bench.harness import Row, Table, grouped, markdown, with_all
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
@@ -34,7 +33,6 @@ from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
-from stitch.session.reading.session_folder import load_session
 from stitch.session.robot import forward
 from stitch.session.session import Cloud, SessionData
 
@@ -58,12 +56,6 @@ HIDDEN: tuple[dict[str, float], ...] = (
     {"backlash": 3.0},
     {"link_geometry": 2.0, "gear_eccentricity": 2.0},
 )
-WRONG = (5, 6, 7, 8)  # of 14 views
-IN_MEASURED_SCANS = (
-    *("two exchanged", "shifted by 1", "reversed", "inverse", "mount", "euler ZYX as xyz", "euler XYZ as ZYX"),
-    *("euler xyz as XYZ", "poses in inches", "poses in m", "clouds scaled 1.0254", "clouds mirrored"),
-)
-IN_MANY_VIEWS = ("each somewhere else", "all off by the same", "scans of each other", "of another part")
 _JOINT_SCATTER = 30e-6  # rad
 _START_GATE = 6.0  # mm: the hand-eye starts near its end
 # Too small a mistake for these cells to tell: nothing may be said of it.
@@ -351,97 +343,3 @@ def mistake_summary(rows: list[Row]) -> list[str]:
 
 
 MISTAKES = Table(mistake_jobs, mistake_trial, mistake_summary, range(1), settings={"every": 1})
-
-
-def _in_many_views(job: Row, wrong: list[int], rng: np.random.Generator) -> Change:
-    """A kind of mistake in several views that do not stand together."""
-    together = _twist(rng)
-    if job["case"] == "each somewhere else":
-        return displaced({v: _twist(rng) for v in wrong})
-    if job["case"] == "all off by the same":
-        return displaced(dict.fromkeys(wrong, together))
-    if job["case"] == "scans of each other":
-        return moved_clouds(dict(zip(wrong, np.roll(wrong, 1).tolist(), strict=True)))
-    part = "curved_drill_plate" if job["part"] != "curved_drill_plate" else "blade"
-    other = session_of(measured_cell(part, job["mount"], job["seed"]))
-    return lambda session: with_clouds(session, {v: shown(other, v) for v in wrong})
-
-
-def many_jobs(seeds: range) -> Iterator[Row]:
-    """Every case in 5 to 8 of 14 views of every cell."""
-    for cell in cells(seeds):
-        for count in WRONG:
-            yield from ({**cell, "wrong": count, "case": case} for case in IN_MANY_VIEWS)
-
-
-def many_trial(job: Row) -> Row:
-    """Refused, the wrong ones left out, or fused with some of them, which must be said."""
-    good = session_of(measured_cell(job["part"], job["mount"], job["seed"]))
-    rng = np.random.default_rng([job["seed"], 9, job["wrong"]])
-    wrong = [int(v) for v in rng.permutation(VIEWS)[: job["wrong"]]]
-    session = _in_many_views(job, wrong, rng)(good)
-    names = {session.views[v].name for v in wrong}
-    try:
-        state = run(session)
-    except StitchError as error:
-        return {"ended": "refused", "said": str(error), "silent": False}
-    out = {item.view for item in state.left_out}
-    # Of two groups that each fit, one is left out: which is right nobody can say from half of the views.
-    rest = set(session.names) - names
-    warned = any(doubt.startswith("No arm scatters") for doubt in state.doubts)
-    mixed = [] if rest <= out else sorted(names - out)
-    ended = {"ended": "doubted" if warned else "fused", "said": sorted(out), "silent": bool(mixed) and not warned}
-    return {**ended, "mixed": mixed, "lost": len(out - names)}
-
-
-def _twist(rng: np.random.Generator) -> Array:
-    """Of the flange: 1° to 3° and 3 to 10 mm."""
-    turn, shift = (x / np.linalg.norm(x) for x in rng.standard_normal((2, 3)))
-    return np.r_[np.radians(rng.uniform(1, 3)) * turn, rng.uniform(3, 10) * shift]
-
-
-def many_summary(rows: list[Row]) -> list[str]:
-    """A line a case."""
-    lines = []
-    for case, group in grouped(rows, "case").items():
-        refused = sum(row["ended"] == "refused" for row in group)
-        silent = sum(row["silent"] for row in group)
-        mixed = sum(bool(row.get("mixed")) for row in group)
-        lost = sum(row.get("lost", 0) for row in group if not row.get("mixed"))
-        lines.append([case, len(group), refused, len(group) - refused - mixed, mixed - silent, silent, lost])
-    head = "wrong views | sessions | refused | all of them left out | some fused, said so | silent | right ones lost"
-    return markdown(head, lines)
-
-
-MANY = Table(many_jobs, many_trial, many_summary, range(1))
-
-
-def measured_jobs(seeds: range) -> Iterator[Row]:
-    """Every mistake in every measured object."""
-    for folder in sorted((SHARED_DATA / "reghec").iterdir()):
-        if (folder / "session.toml").exists():
-            yield from ({"part": folder.name, "case": case} for case in ("nothing", *IN_MEASURED_SCANS))
-
-
-def measured_trial(job: Row) -> Row:
-    """What is said, and whether a run ends as if all were well."""
-    session = load_session(SHARED_DATA / "reghec" / job["part"])
-    mistake = {"nothing": NOTHING, **mistakes(len(session.views), np.random.default_rng(9))}[job["case"]]
-    try:
-        left_out = [item.view for item in run(mistake.apply(session)).left_out]
-        ended = "ran without some" if left_out else "ran"
-    except StitchError:
-        ended = "refused"
-    return {"ended": ended, **judged(session, mistake)}
-
-
-def measured_summary(rows: list[Row]) -> list[str]:
-    """A line a mistake."""
-    lines = []
-    for case, group in grouped(rows, "case").items():
-        counts = [sum(row["ended"] == how for row in group) for how in ("refused", "ran without some", "ran")]
-        lines.append([case, len(group), *counts, sum(row["named"] for row in group)])
-    return markdown("mistake in measured scans | objects | refused | ran without those views | ran | named", lines)
-
-
-MEASURED = Table(measured_jobs, measured_trial, measured_summary, range(1))

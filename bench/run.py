@@ -37,8 +37,6 @@ TABLES = {
     "loads": "points:LOADS",
     "measured-sets": "real_arms:MEASURED",
     "mistakes": "integrity:MISTAKES",
-    "mistakes-in-many-views": "integrity:MANY",
-    "mistakes-in-measured-scans": "integrity:MEASURED",
     "no-mistake": "integrity:GOOD",
     "outside-cells": "outside_cells:TABLE",
     "scanners": "scanners:TABLE",

@@ -7,17 +7,10 @@ Sizes are about 0.15 mrad or 0.05 mm rms. Errors are of the joints (V, n) in rad
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth import kinematics
 from data_synth.moment import Plan
 
 Array = NDArray[np.float64]
 SIZE, SHIFT = 1.5e-4, 0.05
-
-
-def joint_with(plan: Plan, amount: Array, rng: np.random.Generator) -> int:
-    """One of the useful joints of which there is some; where there is none, the joint of which there is most."""
-    some = [i for i in plan.useful if amount[i] > 1e-3 * amount.max()]
-    return int(rng.choice(some or [int(np.argmax(amount))]))
 
 
 def of_joint(plan: Plan, joint: int, course: Array) -> Array:
@@ -43,16 +36,6 @@ def direction(rng: np.random.Generator) -> Array:
     return np.concatenate([SIZE * turn, SHIFT * shift])
 
 
-def of_base_frame(T: Array, turn: Array, shift: Array) -> Array:
-    """(V, 6) of flanges at T (V, 4, 4) that turn and shift so in the base frame, (V, 3) each.
-
-    Turn and shift belong together: the one that is larger for its kind has the usual size.
-    """
-    error = np.concatenate([np.einsum("vji,vj->vi", T[:, :3, :3], x) for x in (turn, shift)], axis=1)
-    sizes = np.sqrt((error.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0)) / [SIZE, SHIFT]
-    return np.asarray(error / max(float(sizes.max()), 1e-12))
-
-
 def standard(course: Array) -> Array:
     """About its mean, of rms 1; 0 where it does not change."""
     return np.asarray((course - course.mean()) / max(float(course.std()), 1e-12))
@@ -62,8 +45,3 @@ def clock(plan: Plan, time: Array | None) -> tuple[Array, float]:
     """Steps since the first view, and how many there are."""
     steps = np.arange(len(plan.joints), dtype=float) if time is None else time - time.min()
     return steps, float(np.ptp(steps)) + 1.0
-
-
-def torque_of(plan: Plan) -> Array:
-    """(V, n) of gravity, which is there where the controller does not know it."""
-    return plan.torque if np.ptp(plan.torque, axis=0).any() else kinematics.gravity_torques(plan.arm, plan.joints)

@@ -241,10 +241,6 @@ def test_every_row_has_its_tests():
 OWN = {"stitch", "data_synth", "viz", "bench"}
 
 
-# It needs a package that tests do without.
-NOT_IMPORTED = {"bench.docs.review"}
-
-
 @pytest.mark.parametrize("folder", ["bench", "examples"])
 def test_what_benches_import_is_there(folder):
     lacking = []
@@ -259,8 +255,6 @@ def test_what_benches_import_is_there(folder):
 
 def found(module, name):
     """Whether a module has a name, or a module below it."""
-    if module in NOT_IMPORTED:
-        return True
     try:
         return hasattr(importlib.import_module(module), name) or bool(importlib.import_module(f"{module}.{name}"))
     except ModuleNotFoundError:
