@@ -226,6 +226,11 @@ def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -
         raise InputError(
             f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
         )
+    if model and model.scanners and len(sessions) == 1 and not first.parts:
+        raise InputError(
+            f"{first.path}: one session, but the model has the hand-eyes of {', '.join(model.scanners)}; to fix: name "
+            "the folder of this session within that run (--hand-eye RUN/SESSION)"
+        )
     for session in sessions:
         if not session.has_clouds and not session.has_sightings:
             raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")

@@ -14,6 +14,7 @@ from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_
 from stitch.effects.contract import EFFECTS
 from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
 from stitch.observations.surfaces.field_error import FieldError
+from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA
 
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.
@@ -48,7 +49,9 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"The model is adequate. {_residual_sentence(d, length_unit)}"
     if d.rotation > 0 or d.translation > 0:
         scatter = _scatter(d.translation, d.rotation, length_unit)
-        yield f"The robot's poses scatter by {scatter} (1 σ), which explains the rest."
+        several = d.linear.measurement.views.scanners
+        scales = f", beside scales of scanners that differ by {100 * SCALE_SIGMA:g} % (1 σ)," if several else ""
+        yield f"The robot's poses scatter by {scatter} (1 σ), which{scales} explains the rest."
         yield _allowed(d, length_unit)
     if d.scanner_error is not None:
         calibration = "" if d.scanner_error.by_view else ", but a calibration may"

@@ -333,9 +333,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     if linear.pose_errors is None:
         return _trend_errors(linear)
     single = _single_error(linear)
-    # Several scanners at one stop see one pose: what they share there is its scatter.
-    scatter = {JOINT_SCATTER, *(STOP_COMPONENTS if linear.measurement.views.scanners else ())}
-    if 0.5 * (linear.restricted(scatter).null.deviance - linear.null.deviance) < limits.ODDS:
+    if 0.5 * (linear.restricted({JOINT_SCATTER}).null.deviance - linear.null.deviance) < limits.ODDS:
         return () if single is None else (single,)
     names = linear.pose_errors.names
     of_arm = tuple(name for name, own in zip(names, linear.pose_errors.arm_components, strict=True) if own)
@@ -349,7 +347,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
             words, 0.5 * (_deviance_without(linear, kind) - linear.null.deviance), joints=words == _FOLLOW_JOINTS
         )
         for words, kind in kinds.items()
-        if any(name in kind and name not in scatter for name in names)
+        if any(name in kind for name in names)
     ]
     wanted = sorted((e for e in errors if e.log_bayes_factor > limits.ODDS), key=lambda e: -e.log_bayes_factor)
     if single is not None:

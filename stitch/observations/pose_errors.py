@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from itertools import permutations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stitch.effects.contract import EFFECTS, Effect, missing_need
 from stitch.model.forward import pose_derivatives
@@ -330,6 +331,8 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     parts, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     processes, by_joints = dict[str, SmoothErrors](), np.zeros(2)
     sessions = list(zip(measurements, centres, strict=True))
+    # Which views share what is anew at every stop.
+    anew = block_diag(*(m.capture.shares_stop for m in measurements))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
         # Effects of one cause share a size.
@@ -346,14 +349,14 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
         parts["smooth"] = (process_covariance(links, alike), SMOOTH_SCALE)
         if constant[0].name == _OFFSET:
             offsets = links[:, : joints.shape[1]]
-            parts[JOINT_SCATTER] = (process_covariance(offsets, np.eye(len(joints))), USUAL_JOINT_SCATTER)
+            parts[JOINT_SCATTER] = (process_covariance(offsets, anew), USUAL_JOINT_SCATTER)
             by_joints = mean_square_per_axis(offsets, measurements, centres)
             processes = joint_processes(measurements, joints, offsets, alike)
     flange = flange_twists(measurements, centres)
     for name, memory in DRIFT_MEMORY.items():
         parts[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
-    if same.sum() > len(same):
+    if same.sum() > anew.sum():
         for name, half in zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True):
             parts[name] = (process_covariance(half, same.astype(float)), 1.0)
     components = np.array([covariance for covariance, _ in parts.values()])

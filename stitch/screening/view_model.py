@@ -168,7 +168,7 @@ def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPos
     gram = unconstrained.overlaps.gram
     mounts = capture.hand_eye_frames(T_mount)
     return ViewModel(
-        reduced=reduce_poses(gram, unconstrained.twists, mounts, capture.T_reference_flange),
+        reduced=reduce_poses(gram, unconstrained.twists, mounts, capture),
         mount_jacobians=hand_eye_jacobian(mounts, gram.centre).reshape(-1, 6, 6),
         centre=gram.centre,
         lever=max(gram.lever, 1e-300),

@@ -21,7 +21,7 @@ from stitch.session.scan import (
     prepare_scan,
     without_stock,
 )
-from stitch.session.scanners import scanner_of, scanners_of
+from stitch.session.scanners import scanner_of, scanners_of, stops_of
 from stitch.session.session import Cloud, Scanner, SessionData
 from stitch.system.threads import parallel
 
@@ -83,6 +83,7 @@ class Capture:
     T_behind_mount: Array | None = None  # (V, 4, 4) what moves the scanner on its mount; None: nothing does
     sightings: Sightings | None = None  # labelled points; scans may be empty then
     scanner: Indices | None = None  # (V,) of several scanners the one of each view
+    stop: Indices | None = None  # (V,) the stop of each, where the flange errs once for all that scan; None: its own
     # How much more the views scatter than the variance of the surfaces' distances says, for so many of them:
     # what clouds weigh beside labelled points.
     noise_factor: float = 1.0
@@ -97,6 +98,12 @@ class Capture:
     def T_base_flange(self) -> Array:
         """(V, 4, 4) from the robot."""
         return self.T_reference_mount if self.scanner_rides else frames.inverse(self.T_reference_mount)
+
+    @property
+    def shares_stop(self) -> Array:
+        """(V, V) 1 for views between which the arm has not moved, else 0."""
+        stop = np.arange(len(self.T_reference_mount)) if self.stop is None else self.stop
+        return np.equal.outer(stop, stop).astype(float)
 
     @property
     def visible_points(self) -> list[Array]:
@@ -146,6 +153,7 @@ class Capture:
             T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],
             sightings=None if self.sightings is None else self.sightings.without(left_out),
             scanner=None if self.scanner is None else self.scanner[keep],
+            stop=None if self.stop is None else np.unique(self.stop[keep], return_inverse=True)[1],
         )
 
 
@@ -169,7 +177,9 @@ def prepare_capture(session: SessionData) -> Capture:
 def of_scanners(session: SessionData, capture: Capture) -> Capture:
     """Return the capture of a joined session with its scanners where they stand to begin with; another as it is."""
     scanners = scanners_of(session)
-    return replace(capture, T_behind_mount=scanners.behind, scanner=scanners.of_view) if scanners else capture
+    if not scanners:
+        return capture
+    return replace(capture, T_behind_mount=scanners.behind, scanner=scanners.of_view, stop=stops_of(session))
 
 
 def build_capture(

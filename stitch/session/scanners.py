@@ -12,6 +12,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.kernels import same_stop
 from stitch.session.session import Scanner, SessionData, View
 
 
@@ -53,6 +54,28 @@ def scanners_of(session: SessionData) -> Scanners:
         np.array([frames.inverse(known[0]) @ T for T in known]),
         tuple(part.scanner.standoff for part in session.parts),
     )
+
+
+def stops_of(session: SessionData) -> Indices:
+    """Return the stop (V,) of each view of a joined session, counted from 0: at one stop scanners see one flange.
+
+    A stop has one scan of a scanner; where all views state their time the arm has been nowhere else in between.
+    """
+    views = session.views
+    same = same_stop(np.array([view.T_base_flange for view in views]))
+    is_in_order = all(view.time_s is not None for view in views)
+    stops = list[list[int]]()
+    for v, view in enumerate(views):
+        for stop in stops[-1:] if is_in_order else stops:
+            if same[v, stop[0]] and all(views[w].scanner != view.scanner for w in stop):
+                stop.append(v)
+                break
+        else:
+            stops.append([v])
+    of_view = np.zeros(len(views), np.int64)
+    for number, stop in enumerate(stops):
+        of_view[stop] = number
+    return of_view
 
 
 def scanner_of(session: SessionData, view: View) -> Scanner:

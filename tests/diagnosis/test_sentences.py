@@ -14,6 +14,10 @@ from stitch.effects.contract import Parameter
 from stitch.observations.surfaces.field_error import FieldError
 
 
+def linear_of(scanners):
+    return SimpleNamespace(measurement=SimpleNamespace(views=SimpleNamespace(scanners=scanners)))
+
+
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
 def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
     common = {
@@ -33,9 +37,15 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "candidates": (),
         "expected_scatter": ScatterLimit(4.5e-5, 0.04),
         "beyond_expected": False,
+        "linear": linear_of(()),
     }
     told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
     assert "20 µm and 0.02 mrad" in told and told.endswith("Not named: a note.")
+    assert "scales of scanners" not in told
+    cell = diagnosis_sentence(
+        SimpleNamespace(**common | {"linear": linear_of(("left", "right"))}, rotation=2e-5, translation=0.02), "mm", None
+    )
+    assert ("beside scales of scanners that differ by 0.02 % (1 σ), explains" in cell) == (verdict == "adequate")
     silent = diagnosis_sentence(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
     assert "13.2 µm" in silent and "mrad" not in silent and "scatter" not in silent
     assert silent.endswith("Not named: a note.")

@@ -90,7 +90,7 @@ class CaptureEvidence:
     @cached_property
     def reduced_poses(self) -> ReducedPoses:
         """The visible directions of the views."""
-        return reduce_poses(self.gram, self.twists, self.hand_eye_frames, self.capture.T_reference_flange)
+        return reduce_poses(self.gram, self.twists, self.hand_eye_frames, self.capture)
 
     @property
     def effect_columns(self) -> Array | None:
@@ -160,7 +160,9 @@ class RigModel:
         )
         R = block_diag(*(r.reduction for r in reduced))
         components = np.array([*white, *(R @ C @ R.T for C in errors.components)])
-        return MixedModel(self.z[None], mean_basis(self.columns)[None], components[:, None], further=errors.prior)
+        shared = block_diag(*(e.common_columns @ e.common_columns.T for e in self.parts))[None]
+        mixed = MixedModel(self.z[None], mean_basis(self.columns)[None], components[:, None], further=errors.prior)
+        return replace(mixed, fixed=shared) if shared.any() else mixed
 
     def reduce(self, twists: Sequence[Array]) -> Array:
         """Return the visible directions (N, K) of twists (6V, K) of every session."""
@@ -340,7 +342,7 @@ def solve_hand_eye(
         for c, f, twists, shared in zip(captures, unconstrained, columns.twists, common or none, strict=True)
     ]
     rig = RigModel(parts)
-    scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns) for e in parts)
+    scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns, e.common_columns) for e in parts)
     prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
     # Twists of the hand-eye, one sigma of the prior each, across those that the motions show.
     sigma = np.diag(prior)[:6] ** -0.5
@@ -393,23 +395,25 @@ def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
     return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
 
 
-def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> ReducedPoses:
+def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Capture) -> ReducedPoses:
     """Return per-view twists reduced to the directions that the overlaps see.
 
     Args:
         g: normal equations about the part's centre, at the free-network poses.
         twists: (V, 6) about that centre, from the model's poses to those.
         hand_eye_frames: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
-        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
-            for eye_to_hand, T_base_flange for eye_in_hand.
+        capture: says how a twist of the flange shows in each view, and which views share one.
     """
     seen = g.visible
     left = seen.vectors.T / seen.scale
     to_centre = frames.make(np.eye(3), -g.centre)
     response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
-    carried = frames.adjoint(to_centre @ T_reference_flange)
-    # Covariances of the visible directions for independent unit turns and shifts of every view's flange.
+    carried = frames.adjoint(to_centre @ capture.T_reference_flange)
+    # Covariances of the visible directions for independent unit turns and shifts of the flange at every stop.
     blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
+    if capture.stop is not None:
+        of_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
+        np.add.at(blocks, capture.stop, of_view)
     return ReducedPoses(
         reduction=left,
         expansion=seen.scale[:, None] * seen.vectors,
@@ -433,9 +437,18 @@ def mean_basis(columns: Array) -> Array:
     return column_space(columns, _OBSERVABLE_SHARE)
 
 
-def estimate_repeatability(reduced: ReducedPoses, further: Array | None = None) -> Repeatability:
-    """Return REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
-    return repeatability_from(fit_variances(hand_eye_mixed_model(reduced, further), both_starts=True).variances)
+def estimate_repeatability(
+    reduced: ReducedPoses, further: Array | None = None, common: Array | None = None
+) -> Repeatability:
+    """Return REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean.
+
+    Args:
+        common: (n, K) beside the scatter, of unit variance each.
+    """
+    mixed = hand_eye_mixed_model(reduced, further)
+    if common is not None and common.size:
+        mixed = replace(mixed, fixed=(common @ common.T)[None])
+    return repeatability_from(fit_variances(mixed, both_starts=True).variances)
 
 
 def repeatability_from(variances: Array) -> Repeatability:
@@ -465,7 +478,7 @@ def whiten_captures(
     stacked = []
     for capture, views, twists in sessions:
         hand_eye_frames = capture.hand_eye_frames(T_mount)
-        reduced = reduce_poses(views.overlaps.gram, views.twists, hand_eye_frames, capture.T_reference_flange)
+        reduced = reduce_poses(views.overlaps.gram, views.twists, hand_eye_frames, capture)
         further = reduced.reduction @ twists
         half = np.linalg.cholesky(pose_covariance(reduced, estimate_repeatability(reduced, further[:, free])))
         columns = np.column_stack([reduced.hand_eye, further, reduced.z + further @ values])
@@ -477,6 +490,4 @@ def whiten_captures(
 def capture_repeatability(capture: Capture, unconstrained: UnconstrainedPoses, T_mount: Array) -> Repeatability:
     """Return the repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
     gram, twists = unconstrained.overlaps.gram, unconstrained.twists
-    return estimate_repeatability(
-        reduce_poses(gram, twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
-    )
+    return estimate_repeatability(reduce_poses(gram, twists, capture.hand_eye_frames(T_mount), capture))

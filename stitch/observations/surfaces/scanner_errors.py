@@ -99,13 +99,26 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
 
     Scans that are all too large by the same share still fit each other, each moved along the way from the part to its
     scanner: so no overlap shows the scale, but the ways of the arm do. An arm whose lengths are all too short looks so.
+    Scans of scanners that differ do not fit, and how each pair then comes to rest hangs on where it overlaps.
     """
     if not measurement.has_optics:
         return np.zeros((6 * len(unconstrained.poses), 1))
-    away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
-    scanners = measurement.views.scanners.masks(len(away))
-    own = [np.hstack([np.zeros_like(away), away * views[:, None]]).ravel() for views in scanners]
-    return SCALE_SIGMA * np.column_stack(own)
+    scanners = measurement.views.scanners
+    if not scanners:
+        away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
+        return SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1)
+    capture = measurement.capture
+    is_own = np.array(scanners.masks(len(capture.scans)))
+
+    def scaled(v: int, index: Indices) -> Array:
+        return -capture.scans[v].points[index] * is_own[:, v, None, None]
+
+    def scaled_targets() -> Array:
+        assert capture.sightings is not None
+        return -np.nan_to_num(capture.sightings.points) * is_own[:, :, None, None]
+
+    sums = stream_point_sums(unconstrained, capture.noise_factor, scaled, scaled_targets)
+    return SCALE_SIGMA * apparent_twists(sums, unconstrained)
 
 
 def sum_smooth_errors(

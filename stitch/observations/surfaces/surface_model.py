@@ -189,7 +189,7 @@ def surface_model(
             views tell.
     """
     g, frames_of_mount = unconstrained.overlaps.gram, capture.hand_eye_frames(model.T_mount)
-    reduced = reduce_poses(g, unconstrained.twists, frames_of_mount, capture.T_reference_flange)
+    reduced = reduce_poses(g, unconstrained.twists, frames_of_mount, capture)
 
     def fit_null(mixed: MixedModel, names: Sequence[str] = ()) -> VarianceFit:
         return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))

@@ -37,7 +37,8 @@ _Output = Annotated[
 _Parent = Annotated[
     str | None, typer.Option("--parent", help="Name of the frame that carries the scanner: flange, base_link …")
 ]
-_Child = Annotated[str, typer.Option("--child", help="Name of the scanner's frame.")]
+_Child = Annotated[str | None, typer.Option("--child", help="Name of the scanner's frame; default scanner.")]
+_Scanner = Annotated[str | None, typer.Option("--scanner", metavar="NAME", help="Of several scanners: whose hand-eye.")]
 _WithEffects = Annotated[
     bool, typer.Option("--with-effects", help="The hand-eye for a program that corrects the model's effects itself.")
 ]
@@ -67,7 +68,8 @@ def export_run(
     program: _Program = None,
     output: _Output = None,
     parent: _Parent = None,
-    child: _Child = "scanner",
+    child: _Child = None,
+    scanner: _Scanner = None,
     with_effects: _WithEffects = False,
     frame: _Frame = None,
     tool: _Tool = None,
@@ -88,6 +90,7 @@ def export_run(
     Examples:
       stitch export runs/blade-17 --to ros
       stitch export runs/blade-17 --to kuka -o scanner.txt
+      stitch export runs/cell --scanner left --to ros
       stitch export runs/blade-17 --to glb -o blade.glb
       stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
       stitch export found-body --program place.src -o corrected.src --frame 0,0,0,0,0,0
@@ -113,7 +116,7 @@ def export_run(
         _export_text(text, to, output, as_json)
     elif to in HAND_EYE_FORMATS:
         with show_activity("export: reading the run"):
-            eye = hand_eye_of_run(run, parent, child, with_effects)
+            eye = hand_eye_of_run(run, parent, child, with_effects, scanner)
         # ROS 1 knows launch files in XML only.
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
         _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output, as_json)

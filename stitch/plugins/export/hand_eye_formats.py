@@ -77,22 +77,48 @@ class ExportedHandEye:
 
 
 def hand_eye_of_run(
-    folder: Path, parent: str | None = None, child: str = "scanner", with_effects: bool = False
+    folder: Path,
+    parent: str | None = None,
+    child: str | None = None,
+    with_effects: bool = False,
+    scanner: str | None = None,
 ) -> ExportedHandEye:
     """Return the corrected hand-eye of a run folder.
 
     Args:
-        parent: name of the frame that carries the scanner; default base_link (eye_to_hand) or flange (eye_in_hand).
+        parent, child: of `hand_eye_from`.
         with_effects: of `hand_eye_from`.
+        scanner: name of one of several.
 
     Raises:
-        InputError: no run, a damaged one, or a name that a frame cannot have.
+        InputError: no run, a damaged one, a name that a frame cannot have, or several scanners of which none is named.
     """
     result = read_result(folder)
-    model = read_model(folder)
+    session = session_of_scanner(result, scanner)
+    own = folder / session if session else folder
+    model = read_model(own)
     if model.mount not in _PARENTS:
-        raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
-    return hand_eye_from(result, model, read_diagnosis(folder), parent, child, with_effects)
+        raise InputError(f"{own}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
+    result = read_result(own) if session else result
+    return hand_eye_from(result, model, read_diagnosis(folder), parent, child or scanner, with_effects)
+
+
+def session_of_scanner(result: dict[str, Any], scanner: str | None) -> str:
+    """Return the name of the session of one of several scanners; "" where there is one.
+
+    Raises:
+        InputError: none of several is named, or one that is not among them.
+    """
+    sessions = {row["scanner"]: row["session"] for row in result.get("scanners", ())}
+    if scanner is None and not sessions:
+        return ""
+    if scanner not in sessions:
+        raise InputError(
+            f"{result['name']}: which scanner? to fix: --scanner {' or '.join(sessions)}"
+            if sessions
+            else f"--scanner {scanner}: {result['name']} is of one scanner; to fix: leave --scanner away"
+        )
+    return str(sessions[scanner])
 
 
 def hand_eye_from(
@@ -100,7 +126,7 @@ def hand_eye_from(
     model: ModelFile,
     diagnosis: dict[str, Any],
     parent: str | None = None,
-    child: str = "scanner",
+    child: str | None = None,
     with_effects: bool = False,
 ) -> ExportedHandEye:
     """Return the corrected hand-eye of a result and its model: at the mean of its effects over the views, unless asked
@@ -110,7 +136,8 @@ def hand_eye_from(
         result: as result.json.
         diagnosis: as diagnosis.json; {} where there is none.
         with_effects: for a program that corrects the effects itself.
-        parent, child: names of frames, as `hand_eye_of_run` takes them.
+        parent: name of the frame that carries the scanner; default base_link (eye_to_hand) or flange (eye_in_hand).
+        child: name of the scanner's frame; default its name among several, else scanner.
 
     Raises:
         InputError: a name that a frame cannot have, or numbers that the views do not show and nobody states.
@@ -164,7 +191,7 @@ def hand_eye_from(
         length_unit=model.length_unit,
         mount=model.mount,
         parent=_require_plain_name("--parent", parent or _PARENTS[model.mount]),
-        child=_require_plain_name("--child", child),
+        child=_require_plain_name("--child", child or "scanner"),
         notes=(*notes, of_effects) if of_effects else tuple(notes),
         of_effects=of_effects,
         axes=tuple((axis["name"], _axis_frame(axis, METRES[model.length_unit])) for axis in axes),

@@ -7,9 +7,9 @@ from stitch.api.verbs import stored_cloud
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.errors import InputError, did_you_mean
 from stitch.output.diagnosis_document import diagnosis_document
-from stitch.output.result_document import model_of, result_document
+from stitch.output.result_document import model_of, result_document, scanner_documents
 from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
-from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
+from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from, session_of_scanner
 from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
 from stitch.run_data import RunData
 from stitch.system.files import whole_file
@@ -21,7 +21,8 @@ def export_run(
     file: Path | str | None = None,
     *,
     parent: str | None = None,
-    child: str = "scanner",
+    child: str | None = None,
+    scanner: str | None = None,
     with_effects: bool = False,
     diagnosis: Diagnosis | None = None,
 ) -> str | None:
@@ -32,6 +33,7 @@ def export_run(
             e57 or glb for the stitched cloud.
         file: is written, whole or not at all; a cloud needs one.
         parent, child: names of the frames that carry the scanner and are the scanner's own.
+        scanner: name of one of several, whose hand-eye it is.
         with_effects: the hand-eye that goes with the model's effects, not that at their mean over the views.
         diagnosis: of the run; what is written says what it found.
 
@@ -40,7 +42,8 @@ def export_run(
         the reference frame.
 
     Raises:
-        InputError: a format that is not known, no file for a cloud, or a run that has no such thing.
+        InputError: a format that is not known, no file for a cloud, a run that has no such thing, or several scanners
+            of which none is named.
 
     Example:
         >>> "T_flange_scanner" in stitch.export_run(run, "ros")
@@ -62,7 +65,10 @@ def export_run(
         text = ARM_FORMATS[to](arm_from(session, model_of(run)))
     elif to in HAND_EYE_FORMATS:
         document = {} if diagnosis is None else diagnosis_document(diagnosis)
-        eye = hand_eye_from(result_document(run), model_of(run), document, parent, child, with_effects)
+        result, model = result_document(run), model_of(run)
+        if own := session_of_scanner(result, scanner):
+            result, model = scanner_documents(run, result)[own]
+        eye = hand_eye_from(result, model, document, parent, child or scanner, with_effects)
         text = HAND_EYE_FORMATS[to](eye)
     else:
         formats = (*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS)
