@@ -43,7 +43,9 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
     assert "20 µm and 0.02 mrad" in told and told.endswith("Not named: a note.")
     assert "scales of scanners" not in told
     cell = diagnosis_sentence(
-        SimpleNamespace(**common | {"linear": linear_of(("left", "right"))}, rotation=2e-5, translation=0.02), "mm", None
+        SimpleNamespace(**common | {"linear": linear_of(("left", "right"))}, rotation=2e-5, translation=0.02),
+        "mm",
+        None,
     )
     assert ("beside scales of scanners that differ by 0.02 % (1 σ), explains" in cell) == (verdict == "adequate")
     silent = diagnosis_sentence(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
