@@ -7,7 +7,7 @@ every view and every size as likely as the others (Kass and Raftery 1995, J. Am.
 over, so that an arm that is worse than most is no mistake of a row.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -56,29 +56,26 @@ def weigh_few_views(
     Args:
         model: of what the unconstrained views say.
     """
-    errors = prior_pose_errors([measurement], hand_eye, [model.centre]).project(model.reduced.reduction)
+    errors = prior_pose_errors([measurement], hand_eye, [model.centre]).of_ordinary_arm.project(model.reduced.reduction)
     usual = errors.scales[:, None, None] ** 2 * errors.components
     rotation, translation = usual_twist(measurement.length_unit)[[0, 3]]
     white = rotation**2 * model.reduced.rotation + translation**2 * model.reduced.translation
     scanner = np.hstack([columns[0] for columns in rig_scanner_errors([measurement], [unconstrained]).values()])
     smooth = model.reduced.reduction @ scanner
-    ordinary = _Covariances(
-        A=model.mixed().A[0],
-        z=model.z,
-        fixed=_NOISE_FACTOR * model.reduced.noise + smooth @ smooth.T,
-        arm=usual[errors.arm_components].sum(axis=0),
-        scatter=white + usual[~errors.arm_components].sum(axis=0),
-    )
-    without, square = ordinary.evidence()
+    z, A = model.z, model.mixed().A[0]
+    fixed = _NOISE_FACTOR * model.reduced.noise + smooth @ smooth.T
+    varying = usual[errors.arm_components].sum(axis=0), white + usual[~errors.arm_components].sum(axis=0)
+    without, square = _evidence(z, A, fixed, *varying)
     sizes = translation * np.array(_DISPLACEMENTS)
     each = []
     for columns in model.views:
         # Shifted, or shifted and turned by as much at the part.
         moved = [size * part for size in sizes for part in (columns, columns[:, 3:])]
-        each.append(logsumexp([ordinary.beside(part).evidence()[0] for part in moved]) - np.log(len(moved)))
+        evidence = [_evidence(z, A, fixed + part @ part.T, *varying)[0] for part in moved]
+        each.append(logsumexp(evidence) - np.log(len(moved)))
     best = int(np.argmax(each))
     log_odds = float(logsumexp(each)) - np.log(len(each)) - without
-    degrees = len(model.z) - ordinary.A.shape[1]
+    degrees = len(z) - A.shape[1]
     return FewViews(
         odds=float(np.exp(np.clip(log_odds, -300, 300))),
         view=best,
@@ -87,32 +84,24 @@ def weigh_few_views(
     )
 
 
-@dataclass(frozen=True)
-class _Covariances:
-    """Of n numbers z: what is known, what the arm adds at a usual size, and what scatter does."""
+def _evidence(z: Array, A: Array, fixed: Array, arm: Array, scatter: Array) -> tuple[float, float]:
+    """Return the log restricted likelihood of z (n,) over all sizes, and the least χ² of z at sizes of ordinary arms.
 
-    A: Array  # (n, r) of a free hand-eye
-    z: Array  # (n,)
-    fixed: Array  # (n, n)
-    arm: Array  # (n, n)
-    scatter: Array  # (n, n)
-
-    def beside(self, columns: Array) -> "_Covariances":
-        """The same with a displacement of unit variance in columns (n, k)."""
-        return replace(self, fixed=self.fixed + columns @ columns.T)
-
-    def evidence(self) -> tuple[float, float]:
-        """Return the log restricted likelihood over all sizes, and the least χ² of z at sizes of ordinary arms."""
-        logs = list[float]()
-        squares = list[float]()
-        for arm_size, size in product(_ARM_SIZES, _SCATTERS):
-            C = self.fixed + arm_size**2 * self.arm + size**2 * self.scatter
-            CA = np.linalg.solve(C, self.A)
-            Cz = np.linalg.solve(C, self.z)
-            mean = self.A.T @ CA
-            square = float(self.z @ Cz - Cz @ self.A @ np.linalg.solve(mean, self.A.T @ Cz))
-            sizes = ((arm_size, *_ARM_PRIOR), (size, *_SCATTER_PRIOR))
-            prior = sum(-0.5 * (np.log(value / median) / spread) ** 2 for value, median, spread in sizes)
-            logs.append(prior - 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.slogdet(mean)[1] + square))
-            squares.append(square)
-        return float(logsumexp(logs)), min(squares)
+    Args:
+        A: (n, r) of a free hand-eye.
+        fixed: (n, n) covariance that is known.
+        arm, scatter: (n, n) what the arm adds at a usual size, and what scatter does.
+    """
+    logs = list[float]()
+    squares = list[float]()
+    for arm_size, size in product(_ARM_SIZES, _SCATTERS):
+        C = fixed + arm_size**2 * arm + size**2 * scatter
+        CA = np.linalg.solve(C, A)
+        Cz = np.linalg.solve(C, z)
+        mean = A.T @ CA
+        square = float(z @ Cz - Cz @ A @ np.linalg.solve(mean, A.T @ Cz))
+        sizes = ((arm_size, *_ARM_PRIOR), (size, *_SCATTER_PRIOR))
+        prior = sum(-0.5 * (np.log(value / median) / spread) ** 2 for value, median, spread in sizes)
+        logs.append(prior - 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.slogdet(mean)[1] + square))
+        squares.append(square)
+    return float(logsumexp(logs)), min(squares)

@@ -239,7 +239,7 @@ def sentence(mistake: str, **words: Any) -> str:
 
 def problem(mistake: str, views: Iterable[str] = (), *, certain: bool = True, **words: Any) -> SessionProblem:
     """Return a mistake of the list as a problem of some views, by their names; of none: of the whole session."""
-    return SessionProblem(_KINDS[mistake], tuple(views), sentence(mistake, **words), certain)
+    return SessionProblem(_KINDS[mistake], tuple(views), sentence(mistake, **words), certain, mistake)
 
 
 @dataclass(frozen=True)

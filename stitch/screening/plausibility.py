@@ -158,7 +158,7 @@ def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
     views = len(session.views)
     unit = session.length_unit
     count = _NUMBERS.get(views, str(views))
-    if snooping.left_out or snooping.suspected:
+    if snooping.left_out:
         return None
     if snooping.blunder_search.null_projector.degrees < 1:
         return sentence("no test", count=count)
@@ -178,7 +178,8 @@ def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
     }
     if few.share < _LIKELY_VIEW:
         return sentence("few views", **words)
-    return sentence("one of few views", view=session.names[few.view], **words)
+    off = (f" ({suspicion_in_words(session, m)})" for m in snooping.suspected if m.view == few.view)
+    return sentence("one of few views", view=session.names[few.view] + next(off, ""), **words)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ class SessionProblem:
     views: tuple[str, ...]
     fix: str  # one line
     certain: bool = True  # False: a hint that the numbers do not prove
+    mistake: str = ""  # its name in the list of `hypotheses`
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as `stitch check --deep --json` prints it."""

@@ -174,7 +174,7 @@ def snoop_views(
     ]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
     few = None
-    accused = standing_out or foreign or tests.steps or tests.null_projector.degrees < 1
+    accused = misplaced or foreign or tests.steps or tests.null_projector.degrees < 1
     if usual is not None and _FEWEST <= model.count <= FEW_VIEWS and not accused:
         few = weigh_few_views(usual.measurement, usual.model, located.unconstrained, model)
     return Snooping(

@@ -61,11 +61,13 @@ _NEIGHBOURS, _AROUND, _PURE = 25, 60, 0.02
 _STEPS, _TORN_STEPS, _NEAR, _CONVERGED, _PATCHES = 40, 20, 0.5, 0.02, 6
 # Stock of fewer sigmas of a single distance, of its own uncertainty or of the poses is none; nor on less of a surface.
 _LEAST, _SURE, _TIMES_SCATTER, _LEAST_SHARE = 1.5, 5.0, 3.0, 0.05
-# Nats by which stock explains more than any motion does, and than none (20,000 to 1), and than a torn scan (150 to 1).
-# Share of distances that are of no surface.
-_MARGIN, _OVER_TORN, _STRAY = 10.0, 5.0, 0.02
+# Nats by which stock explains more than any motion does, and than none (20,000 to 1). Share of distances that are of no
+# surface.
+_MARGIN, _STRAY = 10.0, 0.02
 # Eleven views hardly say how poses scatter: by half of what is usual at the least.
 _LEAST_SCATTER = 0.5
+# Neighbouring distances share points, normals and the scanner's own errors: a region of them is worth a part of so many.
+_ALIKE = 3.0
 # Of two scales of scanners, in sigmas of one: four of their difference.
 _SCALES_APART = 4 * np.sqrt(2)
 # Where more of the views stand off, no other says what their surface is.
@@ -214,7 +216,7 @@ def stock_of(
     if case is None:
         return None
     best = _fit(case, "stock")
-    if best is None or best.share < _LEAST_SHARE or best.over_torn < _OVER_TORN:
+    if best is None or best.share < _LEAST_SHARE or best.over_torn < 0:
         return None
     if abs(best.thickness) < max(_LEAST * case.sigma, _SURE * best.sigma, _TIMES_SCATTER * case.scatter):
         return None
@@ -388,8 +390,8 @@ def _over_torn(case: _Case, rows: Array, e: Array, left: Array, weight: Array) -
     for _ in range(_TORN_STEPS):
         weighted = rows.T * (weight * tukey(moved, case.sigma))
         moved = e - rows @ symmetric_inverse(weighted @ rows) @ (weighted @ e)
-    gain = _evidence(case, left, weight) - _evidence(case, moved, weight)
-    return gain + (6 - 1) / 2 * float(np.log(max(len(e) / case.factor, 1.0)))
+    gain = (_evidence(case, left, weight) - _evidence(case, moved, weight)) * case.factor / _ALIKE
+    return gain + (6 - 1) / 2 * float(np.log(max(len(e) / _ALIKE, 1.0)))
 
 
 def _region(places: Array, e: Array, thickness: float, sigma: float) -> tuple[float, Mask, Mask]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Indices
 from stitch.numerics.units import METRES, length_text
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye, sensor_motions
 from stitch.observations.targets.outliers import drop_mislabelled, find_mislabelled
@@ -31,10 +31,6 @@ _LIMIT_M, _SHARE_OF_MOTION, _CLEARER = 0.005, 0.1, 0.2
 _MAX_HYPOTHESES = 12
 # Views that are tried, of more of them so many in a row all over the session: what is wrong with all shows in these.
 _TRIED, _IN_A_ROW = 60, 6
-
-# How far poses leave the sightings of one target apart: median distance from its middle (length_unit); the hand-eye
-# (4, 4); and the middles (K, 3) in the reference frame, NaN where fewer than two views show one.
-TargetSpread = tuple[float, Array, Array]
 
 
 def target_problems(session: SessionData, sightings: Sightings | None) -> list[SessionProblem]:
@@ -67,16 +63,15 @@ def check_targets(session: SessionData) -> list[SessionProblem]:
         return [moved]
     as_stated = _fit_hypothesis(capture, stated)
     limit = max(_LIMIT_M / METRES[session.length_unit], _SHARE_OF_MOTION * _motion_seen(capture))
-    if as_stated is not None and as_stated[0] < limit:
+    if as_stated < limit:
         return []
     tried = _hypotheses_to_try(session, rows, capture, limit)
-    spreads = [(h, fit[0]) for h in tried if (fit := _fit_hypothesis(capture, h)) is not None]
+    spreads = [(h, _fit_hypothesis(capture, h)) for h in tried]
     best, spread = min(spreads, key=lambda pair: pair[1], default=(stated, np.inf))
-    before = np.inf if as_stated is None else as_stated[0]
-    if not spreads or spread > _CLEARER * before or spread > limit:
-        if as_stated is None:
+    if spread > min(_CLEARER * as_stated, limit):
+        if as_stated == np.inf:
             return []
-        return [problem("unexplained targets", session.names, by=f"{as_stated[0]:.3g} {session.length_unit}")]
+        return [problem("unexplained targets", session.names, by=f"{as_stated:.3g} {session.length_unit}")]
     others = [h.fix for h, other in spreads if other < 2 * spread and h.fix != best.fix]
     views = tuple(session.names[v] for v in rows[list(best.rows)])
     return [SessionProblem(best.kind, views, likeliest_text([best.fix, *others[:2]]))]
@@ -140,8 +135,9 @@ def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, le
         yield stated.undone("sightings", T, factor=factor, units=units)
 
 
-def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> TargetSpread | None:
-    """Return the closed form under a hypothesis; None where it has none."""
+def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> float:
+    """Return how far poses leave the sightings of one target apart: median distance from its middle, length_unit, under
+    the hand-eye in closed form; infinite where it has none."""
     s = capture.sightings
     assert s is not None
     if hypothesis.used is not None:
@@ -151,13 +147,8 @@ def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> TargetSpread | 
     try:
         T_mount = closed_form_hand_eye(posed)
     except (NoResultError, np.linalg.LinAlgError):
-        return None
+        return np.inf
     placed = frames.transform(posed.poses(T_mount), s.points)
-    middles = np.full((len(s.targets), 3), np.nan)
-    apart = []
-    for k in range(len(s.targets)):
-        places = placed[s.used & (s.target == k)]
-        if len(places) > 1:
-            middles[k] = np.median(places, axis=0)
-            apart.append(np.linalg.norm(places - middles[k], axis=1))
-    return (float(np.median(np.concatenate(apart))), T_mount, middles) if apart else None
+    by_target = [placed[s.used & (s.target == k)] for k in range(len(s.targets))]
+    apart = [np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in by_target if len(p) > 1]
+    return float(np.median(np.concatenate(apart))) if apart else np.inf

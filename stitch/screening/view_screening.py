@@ -195,7 +195,9 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
     return ViewScreening(
         left_out=_misplaced_views(session, capture, T_mount, snooping),
         suspected=tuple(
-            _excluded_view(session, m.view, suspicion_in_words(session, m), poses) for m in snooping.suspected
+            _excluded_view(session, m.view, suspicion_in_words(session, m), poses)
+            for m in snooping.suspected
+            if snooping.few is None
         ),
         links=ViewLinks(
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
@@ -221,9 +223,9 @@ def _misplaced_views(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> tuple[ExcludedView, ...]:
     problems = explain_misplaced(session, capture, T_mount, snooping) if snooping.left_out else []
-    disconnected = next((found for found in problems if found.kind == "disconnected"), None)
-    if disconnected is not None and not snooping.alone:
-        raise NoResultError(f"{session.path}: {disconnected.line(session.names)}")
+    apart = next((found for found in problems if found.mistake == "groups"), None)
+    if apart is not None:
+        raise NoResultError(f"{session.path}: {apart.line(session.names)}")
     poses = capture.poses(T_mount)
     why = {name: found.line(session.names) for found in reversed(problems) for name in found.views}
     return tuple(

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, MonteCarlo, Number
+from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, Number
 from stitch.plugins.metrology.error_sources import NOT_INCLUDED
 from stitch.plugins.watch.dfq_file import Characteristic
 
 MEASURE_FORMAT = "stitch-measure/1"
 
 
-def measure_document(measured: MeasuredFeatures, run: str = "", trials: MonteCarlo | None = None) -> dict[str, Any]:
+def measure_document(measured: MeasuredFeatures, run: str = "") -> dict[str, Any]:
     """Return features.json: all numbers with their budgets, and the covariance of all of them together."""
-    trials = trials or measured.checked
+    trials = measured.checked
     ratios = [None] * len(measured.numbers) if trials is None else trials.ratio.tolist()
     return {
         "format": MEASURE_FORMAT,

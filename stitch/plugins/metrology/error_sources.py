@@ -235,7 +235,7 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
     of the scanner, which are sources of their own."""
     rig = chain.solution.rig
     g = chain.unconstrained.overlaps.gram
-    errors = prior_pose_errors([run.measurement], run.model, [g.centre])
+    errors = prior_pose_errors([run.measurement], run.model, [g.centre]).of_ordinary_arm
     errors = errors.restricted(errors.causes - {JOINT_SCATTER})
     reduced_smooth = rig.reduce([smooth])
     mixed = replace(rig.mixed(errors), fixed=(reduced_smooth @ reduced_smooth.T)[None])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +14,7 @@ from stitch.cli.terminal import emit, say, show_block, show_files, show_next, sh
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.plugins.metrology.budget import MeasuredFeatures, MonteCarlo, Number
+    from stitch.plugins.metrology.budget import MeasuredFeatures, Number
 
 _SOURCES = 3  # that are shown of a budget
 _FEWEST_TRIALS = 200
@@ -47,11 +46,10 @@ def measure(
     from stitch.output.json_file import to_json, write_json
     from stitch.output.run_folder import call_entry_points, lock_run_folder
     from stitch.output.stored_run import load_run
-    from stitch.plugins.metrology.budget import measure_features, monte_carlo
     from stitch.plugins.metrology.documents import measure_csv, measure_document
     from stitch.plugins.metrology.error_sources import place_errors
-    from stitch.plugins.metrology.feature_file import read_features
     from stitch.plugins.metrology.place_errors import point_sigmas, write_sigmas
+    from stitch.plugins.metrology.verb import measure as measure_run
     from stitch.system.files import whole_file
 
     _require_measure_options(features, trials, dfq)
@@ -62,12 +60,8 @@ def measure(
             write_sigmas(run / "stitched.ply", sigma)
             say(f"stitched.ply has the column sigma for {len(sigma):,} points.")
             return
-        wanted = read_features(features, state.session.length_unit, state.measurement.capture.spacing)
-        places = place_errors(state)
-        measured = measure_features(places, wanted)
-        seen = replace(wanted, features=tuple(f for f in wanted.features if f.name not in measured.not_measured))
-        checked = monte_carlo(places, seen, measured.fits, trials) if trials else None
-        document = measure_document(measured, str(run), checked)
+        measured = measure_run(state, features, trials=trials)
+        document = measure_document(measured, str(run))
         write_json(document, run / "features.json")
         with whole_file(run / "features.csv") as file:
             file.write_text(measure_csv(measured), encoding="utf-8")
@@ -77,7 +71,7 @@ def measure(
     if as_json:
         emit(to_json(document))
         return
-    _show_numbers(measured, checked)
+    _show_numbers(measured)
     show_files(run, ("features.json", "features.csv", "features.html"))
     show_next(f"Next: stitch verify {shlex.quote(str(run))} ARTEFACT")
 
@@ -102,7 +96,7 @@ def _write_dfq(measured: MeasuredFeatures, part: str, run: Path, file: Path) -> 
         scratch.write_bytes(text.encode("utf-8-sig"))
 
 
-def _show_numbers(measured: MeasuredFeatures, checked: MonteCarlo | None) -> None:
+def _show_numbers(measured: MeasuredFeatures) -> None:
     from stitch.plugins.metrology.error_sources import NOT_INCLUDED
     from stitch.plugins.metrology.verification import agreeing, verified_numbers
 
@@ -112,7 +106,7 @@ def _show_numbers(measured: MeasuredFeatures, checked: MonteCarlo | None) -> Non
         for n in measured.numbers
     ]
     show_table(title, ("number", "value", "off nominal", "U", "most of U"), rows, words=("number", "most of U"))
-    if checked is not None:
+    if (checked := measured.checked) is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())
         say(f"Monte Carlo over propagation, {checked.trials:,} trials: {low:.3f} to {high:.3f}.")
     numbers = verified_numbers(measured)
