@@ -66,7 +66,7 @@ _LEAST, _SURE, _TIMES_SCATTER, _LEAST_SHARE = 1.5, 5.0, 3.0, 0.05
 _MARGIN, _STRAY = 10.0, 0.02
 # Eleven views hardly say how poses scatter: by half of what is usual at the least.
 _LEAST_SCATTER = 0.5
-# Neighbouring distances share points, normals and the scanner's own errors: a region of them is worth a part of so many.
+# Neighbouring distances share points, normals and the scanner's own errors: so many of a region are worth one.
 _ALIKE = 3.0
 # Of two scales of scanners, in sigmas of one: four of their difference.
 _SCALES_APART = 4 * np.sqrt(2)

@@ -15,7 +15,7 @@ from stitch.errors import NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.feature_file import Contribution, FeatureList
 from stitch.plugins.metrology.features import NUMBERS, Feature, FittedFeature, fit_feature, position_of, reach_of
-from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, Responses, RunPoints
+from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, RunPoints
 from stitch.system.values import Table
 
 # The variances are posterior means, which hold already that they are not well known: twice their root covers 95 %
@@ -139,9 +139,12 @@ def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[tuple[
 def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature]) -> MeasuredFeatures:
     """Return the numbers of fits and of distances between them, under all that may be wrong about the places."""
     quantities, values, nominal, slopes = number_table(wanted.features, fits)
-    responses = stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
-    variances, vectors = np.linalg.eigh(responses.noise)
-    rows = [(s.name, responses.loadings(s), s.degrees) for s in _not_stated(places, wanted)]
+    counted = replace(places, sources=_not_stated(places, wanted))
+    of_fits, noise = zip(*(counted.loadings(fit.at, fit.gradient) for fit in fits), strict=True)
+    variances, vectors = np.linalg.eigh(slopes @ block_diag(*noise) @ slopes.T)
+    ends = np.cumsum([source.views.shape[1] for source in counted.sources])[:-1]
+    of_sources = np.split(slopes @ np.vstack(of_fits), ends, axis=1)
+    rows = [(s.name, loadings, s.degrees) for s, loadings in zip(counted.sources, of_sources, strict=True)]
     rows.append((OWN_NOISE, vectors * np.sqrt(np.maximum(variances, 0.0)), np.inf))
     rows += [(c.source, _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
     covariance = np.sum([loadings @ loadings.T for _, loadings, _ in rows], axis=0)
@@ -175,10 +178,10 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     return MeasuredFeatures(tuple(numbers), covariance[np.ix_(kept, kept)], tuple(fits), length_unit)
 
 
-def _not_stated(places: PlaceErrors, wanted: FeatureList) -> list[ErrorSource]:
+def _not_stated(places: PlaceErrors, wanted: FeatureList) -> tuple[ErrorSource, ...]:
     """Return the sources that count: what is stated under the name of one takes the place of what is usual."""
     stated = {contribution.source for contribution in wanted.contributions}
-    return [source for source in places.sources if source.name not in stated]
+    return tuple(source for source in places.sources if source.name not in stated)
 
 
 def measured_rows(quantities: Sequence[tuple[Feature, str]]) -> list[int]:
@@ -201,17 +204,6 @@ def _runs_along_axis(feature: Feature, fits: Sequence[FittedFeature]) -> str | N
         along /= max(float(np.linalg.norm(along)), 1e-300)
     axial = (fit.feature for fit in ends if fit.feature.kind in AXIAL)
     return next((f.name for f in axial if abs(f.axis @ along) > _ALONG_AXIS), None)
-
-
-def stack_responses(parts: Sequence[Responses]) -> Responses:
-    """Return the responses of several fits as one; each has noise of its own."""
-    return Responses(
-        np.vstack([part.views for part in parts]),
-        np.vstack([part.parameters for part in parts]),
-        np.vstack([part.field for part in parts]),
-        np.vstack([part.scans for part in parts]),
-        block_diag(*(part.noise for part in parts)),
-    )
 
 
 def number_table(
@@ -338,10 +330,8 @@ def _refits(
 ) -> Array:
     """(M, q) numbers of a feature from its points as M trials move them."""
     twists = np.sum([s.views @ drawn for s, drawn in modes], axis=0).T
-    parameters = np.sum([s.parameters @ drawn for s, drawn in modes], axis=0).T
-    field = np.sum([s.field @ drawn for s, drawn in modes], axis=0).T
-    of_points = np.hstack([parameters, field])
-    shapes, noise = places.point_modes(fit.at)
+    of_points = np.sum([s.shapes @ drawn for s, drawn in modes], axis=0).T
+    shapes, noise = places.point_shapes(fit.at)
     own = [(drawn, places.scan_shapes(fit.at, s.scan)) for s, drawn in modes if s.scan is not None]
     numbers = np.empty((trials, len(fit.values)))
     for start in range(0, trials, _TRIAL_BLOCK):

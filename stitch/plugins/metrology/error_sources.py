@@ -200,7 +200,7 @@ def _source(chain: ErrorChain, modes: _Modes, kinds: int, shapes: Array | None =
     parameters = np.zeros((len(chain.fitted), x.shape[1]))
     parameters[chain.fitted] = x[6:]
     field = np.zeros((kinds, x.shape[1])) if shapes is None else shapes
-    return ErrorSource(name, views, parameters[chain.of_points], field, degrees)
+    return ErrorSource(name, views, np.vstack([parameters[chain.of_points], field]), degrees)
 
 
 def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, list[tuple[str, Array, float]], ScanErrors | None]:

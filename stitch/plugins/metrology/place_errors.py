@@ -30,8 +30,7 @@ class ErrorSource:
 
     name: str
     views: Array  # (6V, m) left twists about `PlaceErrors.centre` by which the registered views err
-    parameters: Array  # (P, m) errors of parameters of effects that change points
-    field: Array  # (K, m) smooth errors of the scanner
+    shapes: Array  # (P + K, m) errors of parameters of effects that change points, then smooth errors of the scanner
     degrees: float  # of freedom with which its size is known
     scan: int | None = None  # its modes are those of `ScanErrors`, of this scan alone
 
@@ -48,32 +47,6 @@ class RunPoints:
     def take(self, keep: Indices) -> "RunPoints":
         """The points of some indices."""
         return RunPoints(self.points[keep], self.normals[keep], self.view[keep], self.index[keep])
-
-
-@dataclass(frozen=True)
-class Responses:
-    """What q numbers answer to errors of the places, per unit of each."""
-
-    views: Array  # (q, 6V) to left twists of the views
-    parameters: Array  # (q, P)
-    field: Array  # (q, K)
-    scans: Array  # (q, V, M) to the modes of each scan's own smooth errors
-    noise: Array  # (q, q) covariance by the noise of their own points
-
-    def loadings(self, source: ErrorSource) -> Array:
-        """(q, m) what each mode of a source does to the numbers."""
-        of_all = self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field
-        return of_all if source.scan is None else of_all + self.scans[:, source.scan]
-
-    def combined(self, slopes: Array) -> "Responses":
-        """The same of numbers with slopes (p, q) in these."""
-        return Responses(
-            slopes @ self.views,
-            slopes @ self.parameters,
-            slopes @ self.field,
-            np.tensordot(slopes, self.scans, axes=1),
-            slopes @ self.noise @ slopes.T,
-        )
 
 
 @dataclass(frozen=True)
@@ -101,13 +74,12 @@ class PlaceErrors:
             np.concatenate(kept).astype(np.int64),
         )
 
-    def responses(self, at: RunPoints, gradient: Array) -> "Responses":
-        """What numbers with these slopes (q, N, 3) in the points, reference frame, answer to errors of the places."""
+    def loadings(self, at: RunPoints, gradient: Array) -> tuple[Array, Array]:
+        """Return what each mode of all sources, side by side, does to numbers (q, M) with these slopes (q, N, 3) in the
+        points, reference frame, and their covariance (q, q) by the noise of their own points."""
         views = np.zeros((len(gradient), len(self.poses), 6))
-        field = np.zeros((len(gradient), self.modes_of_field))
-        parameters = np.zeros((len(gradient), self.parameters))
-        own = 0 if self.scan_errors is None else self.scan_errors.count
-        scans = np.zeros((len(gradient), len(self.poses), own))
+        shapes = np.zeros((len(gradient), len(self.sources[0].shapes)))
+        of_scans = dict[int | None, Array]()
         noise = np.zeros((len(gradient), len(gradient)))
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
@@ -116,29 +88,25 @@ class PlaceErrors:
             views[:, v, 3:] = g.sum(axis=1)
             index = at.index[of_view]
             g_scanner = frames.rotate(frames.inverse(self.poses[v]), g)
-            field += np.einsum("qni,kni->qk", g_scanner, self.field_modes(v, index))
+            shapes += np.einsum("qni,kni->qk", g_scanner, self.point_modes(v, index))
             if self.scan_errors is not None:
                 along_ray, modes = self.scan_modes(v, index)
-                scans[:, v] = np.einsum("qni,ni->qn", g_scanner, along_ray) @ modes
-            if self.slopes is not None:
-                parameters += np.einsum("qni,kni->qk", g_scanner, self.slopes.at(v, self.poses[v], index))
+                of_scans[int(v)] = np.einsum("qni,ni->qn", g_scanner, along_ray) @ modes
             scan = self.capture.scans[v]
             along = scan.noise * np.einsum("qni,ni->qn", g_scanner, scan.normals[index])
             noise += along @ along.T
-        return Responses(views.reshape(len(gradient), -1), parameters, field, scans, noise)
+        twists = views.reshape(len(gradient), -1)
+        every = [twists @ s.views + shapes @ s.shapes + of_scans.get(s.scan, 0.0) for s in self.sources]
+        return np.hstack(every), noise
 
-    def point_modes(self, at: RunPoints) -> tuple[Array, Array]:
+    def point_shapes(self, at: RunPoints) -> tuple[Array, Array]:
         """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), and the noise of
         each along its normal (N, 3), reference frame."""
-        shapes = np.zeros((self.parameters + self.modes_of_field, len(at.points), 3))
+        shapes = np.zeros((len(self.sources[0].shapes), len(at.points), 3))
         noise = np.zeros_like(at.points)
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
-            index = at.index[of_view]
-            modes = self.field_modes(v, index)
-            if self.slopes is not None:
-                modes = np.concatenate([self.slopes.at(v, self.poses[v], index), modes])
-            shapes[:, of_view] = frames.rotate(self.poses[v], modes)
+            shapes[:, of_view] = frames.rotate(self.poses[v], self.point_modes(v, at.index[of_view]))
             noise[of_view] = self.capture.scans[v].noise * at.normals[of_view]
         return shapes, noise
 
@@ -161,21 +129,12 @@ class PlaceErrors:
             moved[:, of_view] = points[:, of_view] @ T[:, v, :3, :3].transpose(0, 2, 1) + T[:, None, v, :3, 3]
         return moved
 
-    @property
-    def modes_of_field(self) -> int:
-        """K."""
-        return len(self.sources[0].field)
-
-    @property
-    def parameters(self) -> int:
-        """P."""
-        return len(self.sources[0].parameters)
-
-    def field_modes(self, v: int, index: Indices) -> Array:
-        """(K, N, 3) by which points of view v lie off per unit of each smooth error, scanner frame."""
+    def point_modes(self, v: int, index: Indices) -> Array:
+        """(P + K, N, 3) by which points of view v move per unit of each parameter and smooth error, scanner frame."""
         scan = self.capture.scans[v]
         cosine = self.measurement.scan_views[v].cosine[index]
-        return -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
+        smooth = -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
+        return smooth if self.slopes is None else np.concatenate([self.slopes.at(v, self.poses[v], index), smooth])
 
     def scan_modes(self, v: int, index: Indices) -> tuple[Array, Array]:
         """Return rays (N, 3) to points of view v, scanner frame, and by how much each mode of its own smooth errors
@@ -228,19 +187,15 @@ def _views_of(places: PlaceErrors, points: Array, cell: float) -> tuple[Mask, In
 def _of_points(places: PlaceErrors, views: Mask, shares: Array, nearest: Indices, normals: Array) -> Array:
     """(n, modes) by which errors of the points themselves move fused points along their normals."""
     out = np.zeros((len(normals), sum(source.views.shape[1] for source in places.sources)))
-    field = np.concatenate([source.field for source in places.sources], axis=1)
-    parameters = np.concatenate([source.parameters for source in places.sources], axis=1)
+    shapes = np.hstack([source.shapes for source in places.sources])
     ends = np.cumsum([source.views.shape[1] for source in places.sources])
     of_scan = {s.scan: slice(end - s.views.shape[1], end) for s, end in zip(places.sources, ends, strict=True)}
     for v in np.flatnonzero(views):
         seen = frames.rotate(frames.inverse(places.poses[v]), normals)
-        out += shares[v] * np.einsum("ni,kni->nk", seen, places.field_modes(int(v), nearest[:, v])) @ field
+        out += shares[v] * np.einsum("ni,kni->nk", seen, places.point_modes(int(v), nearest[:, v])) @ shapes
         if places.scan_errors is not None:
             along_ray, modes = places.scan_modes(int(v), nearest[:, v])
             out[:, of_scan[int(v)]] += shares[v] * np.einsum("ni,ni->n", seen, along_ray)[:, None] * modes
-        if places.slopes is not None:
-            slopes = places.slopes.at(int(v), places.poses[v], nearest[:, v])
-            out += shares[v] * np.einsum("ni,kni->nk", seen, slopes) @ parameters
     return out
 
 

@@ -21,7 +21,6 @@ from stitch.plugins.metrology.budget import (
     fit_features,
     monte_carlo,
     number_table,
-    stack_responses,
 )
 from stitch.plugins.metrology.error_sources import INCIDENCE, OVERLAPS, SCANNER, error_chain, place_errors
 from stitch.plugins.metrology.feature_file import Contribution, FeatureList
@@ -54,10 +53,11 @@ def _numbers(state, wanted):
     return values
 
 
-def _responses(places, wanted):
+def _loadings(places, wanted, source):
+    places = replace(places, sources=(source,))
     fits = fit_features(places.points, wanted.features)[0]
     _, _, _, slopes = number_table(wanted.features, fits)
-    return stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
+    return slopes @ np.vstack([places.loadings(fit.at, fit.gradient)[0] for fit in fits])
 
 
 def _lengths(wanted, values):
@@ -75,12 +75,12 @@ def test_smooth_scanner_error_moves_features_as_predicted(cell):
     state, places, wanted = cell
     smooth = next(s for s in places.sources if s.name == SCANNER)
     k, size = 2, 0.05  # one that is coarse over the field, mm
-    of_modes = np.linalg.lstsq(smooth.field, np.eye(len(smooth.field))[k])[0]
-    predicted = _responses(places, wanted).loadings(smooth) @ of_modes * size
+    of_modes = np.linalg.lstsq(smooth.shapes, np.eye(len(smooth.shapes))[k])[0]
+    predicted = _loadings(places, wanted, smooth) @ of_modes * size
     views = []
     for v, view in enumerate(state.session.views):
         scan = state.measurement.capture.scans[v]
-        moved = scan.points + size * places.field_modes(v, np.arange(len(scan.points)))[k]
+        moved = scan.points + size * places.point_modes(v, np.arange(len(scan.points)))[k]
         views.append(replace(view, cloud=replace(view.cloud, points=moved)))
     again = run(replace(state.session, views=tuple(views)))
     seen = _lengths(wanted, _numbers(again, wanted) - _numbers(state, wanted))
@@ -107,7 +107,10 @@ def test_error_of_one_pose_moves_features_as_predicted(cell):
     left = frames.adjoint(frames.make(np.eye(3), -errors.centre) @ bare[v].T_base_flange) @ xi
     twist = np.zeros((6 * len(bare), 1))
     twist[6 * v : 6 * v + 6, 0] = -left  # the true pose is the reported one less this
-    predicted = _lengths(wanted, (_responses(errors, wanted).views @ chain.of_poses(twist)[0])[:, 0])
+    source = replace(
+        errors.sources[0], views=chain.of_poses(twist)[0], shapes=np.zeros((len(errors.sources[0].shapes), 1))
+    )
+    predicted = _lengths(wanted, _loadings(errors, wanted, source)[:, 0])
     seen = _lengths(wanted, _numbers(after, wanted) - _numbers(before, wanted))
     _require_alike(seen, predicted)
 
@@ -117,7 +120,7 @@ def test_shares_add_up_and_the_largest_source_is_named(cell):
     fits = fit_features(places.points, wanted.features)[0]
     for name in {source.name for source in places.sources}:
         larger = tuple(
-            replace(s, views=50 * s.views, field=50 * s.field) if s.name == name else s for s in places.sources
+            replace(s, views=50 * s.views, shapes=50 * s.shapes) if s.name == name else s for s in places.sources
         )
         found = evaluate(replace(places, sources=larger), wanted, fits)
         for number in found.numbers:
@@ -128,7 +131,7 @@ def test_shares_add_up_and_the_largest_source_is_named(cell):
 
 def test_a_scanner_without_smooth_errors_is_not_charged_with_large_ones(cell):
     _, places, _ = cell
-    field, incidence = (np.linalg.norm(source.field, axis=1).max() for source in places.sources[:2])
+    field, incidence = (np.linalg.norm(source.shapes, axis=1).max() for source in places.sources[:2])
     # Usual is 0.3 of the noise; its logarithm scatters by 0.7, so that one sigma more is 0.6.
     assert field < 0.3 * 0.02 and incidence < 0.6 * 0.02
     assert places.scan_errors.size < 0.3 * 0.02
