@@ -38,8 +38,6 @@ _TOO_LARGE = 0.05
 _FEWEST = 20
 # A surface whose own radius is this much off the sphere's is something else.
 _OTHER = 0.2
-# Step of the central differences (rad and lengths).
-_STEP = 1e-5
 # Mean square over the numbers of a view, in sigmas: beyond it a view counts less (a view in 150 by chance).
 _OUTLYING = 4.0
 # Views whose 21 numbers leave as many as the fit has unknowns, and a few more.
@@ -91,36 +89,18 @@ def sphere_view(name: str, points: Array, radius: float, side: float = 0.0) -> S
         raise InputError(f"view {name}: {len(points)} points on the sphere are too few; leave the view out")
     middle = points.mean(axis=0)
     _U, s, Vt = np.linalg.svd(points - middle, full_matrices=False)
-    if s[2] > _FLAT * s[0]:
-        return _area(name, points, radius)
-    circle = fit_ball((points - middle) @ Vt[:2].T, radius)
-    if circle.radius > (1 + _TOO_LARGE) * radius:
+    is_line = s[2] <= _FLAT * s[0]
+    axes = Vt[:2] if is_line else np.eye(3)
+    # Of an area scan the centre with the known radius starts the search; what is measured has a free one.
+    first = fit_ball((points - middle) @ axes.T, radius, known=not is_line)
+    kept = points[first.keep]
+    free = first if is_line or len(kept) < _FEWEST else fit_ball((kept - middle) @ axes.T, radius)
+    if is_line and first.radius > (1 + _TOO_LARGE) * radius:
         raise InputError(
-            f"view {name}: the line is a circle of radius {circle.radius:.4g}, larger than the sphere's {radius:.4g}; "
+            f"view {name}: the line is a circle of radius {first.radius:.4g}, larger than the sphere's {radius:.4g}; "
             "check sphere.radius in session.toml and cloud_unit"
         )
-    kept = points[circle.keep]
-    return SphereView(
-        name=name,
-        points=kept,
-        dropped=int((~circle.keep).sum()),
-        foot=middle + circle.centre @ Vt[:2],
-        normal=arc_normal(kept, Vt[2]),
-        offset=float(np.sqrt(max(radius**2 - circle.radius**2, 0.0))),
-        sigma=circle.sigma,
-        side=float(np.sign(side)),
-        directions=Vt[:2],
-        measured=np.append(circle.centre + Vt[:2] @ middle, circle.radius),
-        covariance=circle.covariance,
-    )
-
-
-def _area(name: str, points: Array, radius: float) -> SphereView:
-    """The centre with the known radius starts the search; centre and radius, both free, are what is measured."""
-    known = fit_ball(points, radius, known=True)
-    kept = points[known.keep]
-    free = fit_ball(kept, radius) if len(kept) >= _FEWEST else known
-    if len(kept) < _FEWEST or not 1 - _OTHER < free.radius / radius < 1 + _OTHER:
+    if not is_line and (len(kept) < _FEWEST or not 1 - _OTHER < free.radius / radius < 1 + _OTHER):
         raise InputError(
             f"view {name}: no sphere of radius {radius:.4g} among its points (the best has {free.radius:.4g}); check "
             "sphere.radius in session.toml and cloud_unit, or leave the view out"
@@ -128,14 +108,14 @@ def _area(name: str, points: Array, radius: float) -> SphereView:
     return SphereView(
         name=name,
         points=kept,
-        dropped=int((~known.keep).sum()),
-        foot=known.centre,
-        normal=np.zeros(3),
-        offset=0.0,
+        dropped=int((~first.keep).sum()),
+        foot=middle + first.centre @ axes,
+        normal=arc_normal(kept, Vt[2]) if is_line else np.zeros(3),
+        offset=float(np.sqrt(max(radius**2 - first.radius**2, 0.0))) if is_line else 0.0,
         sigma=free.sigma,
-        side=0.0,
-        directions=np.eye(3),
-        measured=np.append(free.centre, free.radius),
+        side=float(np.sign(side)) if is_line else 0.0,
+        directions=axes,
+        measured=np.append(free.centre + axes @ middle, free.radius),
         covariance=free.covariance,
     )
 
@@ -166,20 +146,24 @@ class SphereState:
         return SphereState(self.T_mount @ frames.exp(x[:6]), self.centre + x[6:9], radius)
 
 
-def _residuals(G: Array, views: Sequence[SphereView], state: SphereState) -> tuple[list[Array], list[Array]]:
-    """Predicted less measured circle or sphere of each view, (k + 1,), and its response to a shift, (k + 1, 3)."""
-    seen = frames.transform(frames.inverse(G @ state.T_mount), state.centre[None])[:, 0]
-    out, response = [], []
-    for view, q in zip(views, seen, strict=True):
-        if view.is_line:
-            height = float((q - view.foot) @ view.normal)
-            rho = np.sqrt(max(state.radius**2 - height**2, 1e-4 * state.radius**2))
-            last = -height / rho * view.normal
-        else:
-            rho, last = state.radius, np.zeros(3)
+def linearise_sphere(
+    G: Array, views: Sequence[SphereView], state: SphereState, n: int
+) -> tuple[list[Array], list[Array], list[Array]]:
+    """Predicted less measured circle or sphere of each view, (k + 1,), and its response to a step of the state, (k + 1,
+    n), and to a shift of the sphere, (k + 1, 3)."""
+    back = frames.inverse(G @ state.T_mount)
+    seen = frames.transform(back, state.centre[None])[:, 0]
+    out, jacobian, response = [], [], []
+    for view, q, R in zip(views, seen, back[:, :3, :3], strict=True):
+        height = float((q - view.foot) @ view.normal)
+        rho = np.sqrt(max(state.radius**2 - height**2, 1e-4 * state.radius**2))
+        shift = np.vstack([view.directions, -height / rho * view.normal])
         out.append(np.append(view.directions @ q, rho) - view.measured)
-        response.append(np.vstack([view.directions, last]))
-    return out, response
+        step = np.hstack([shift @ np.hstack([frames.skew(q), -np.eye(3), R]), np.zeros((len(shift), 1))])
+        step[-1, 9] = state.radius / rho
+        jacobian.append(step[:, :n])
+        response.append(shift)
+    return out, jacobian, response
 
 
 def solve_sphere(
@@ -189,21 +173,9 @@ def solve_sphere(
     W = [np.linalg.cholesky(w).T for w in weights]
 
     def residual(x: Array) -> Array:
-        return np.concatenate([w @ r for w, r in zip(W, _residuals(G, views, state.moved(x))[0], strict=True)])
+        return np.concatenate([w @ r for w, r in zip(W, linearise_sphere(G, views, state.moved(x), n)[0], strict=True)])
 
     return state.moved(least_squares(residual, np.zeros(n), "3-point", x_scale="jac").x)
-
-
-def linearise_sphere(
-    G: Array, views: Sequence[SphereView], state: SphereState, n: int
-) -> tuple[list[Array], list[Array], list[Array]]:
-    """Residuals, their Jacobians (k + 1, n) and responses to a shift, by view."""
-    e, response = _residuals(G, views, state)
-    sides = [[_residuals(G, views, state.moved(s * h))[0] for s in (1, -1)] for h in _STEP * np.eye(n)]
-    jacobian = [
-        np.column_stack([(plus[v] - minus[v]) / (2 * _STEP) for plus, minus in sides]) for v in range(len(views))
-    ]
-    return e, jacobian, response
 
 
 def view_covariances(
