@@ -16,16 +16,16 @@ from stitch.fit.fit import FittedRig, FittedSession
 from stitch.fit.surface_steps import per_view_rms
 from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
-from stitch.numerics.distributions import chi2_limit, chi2_tail, f_tail
+from stitch.numerics.distributions import chi2_tail, f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import significantly_smaller
 from stitch.numerics.units import length_text
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
-from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
-from stitch.screening.hand_eye_transfer import hand_eye_difference, mahalanobis_square
+from stitch.screening.hand_eye_transfer import hand_eye_difference, hand_eye_transfer, mahalanobis_square
 from stitch.screening.hypotheses import sentence
 from stitch.screening.plausibility import beyond_any_arm
+from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
 
 # A hand-eye that differs by chance alone is refused once in a million.
@@ -48,25 +48,21 @@ _NUMBERS_PER_VIEW, _NUMBERS_PER_SESSION = 3, 12
 FitWithArm = Callable[[ModelFile | None], FittedRig]
 
 
-def require_matching_hand_eye(session: SessionData, correction: Correction, index: int) -> None:
+def require_matching_hand_eye(
+    session: SessionData, measurement: Measurement, correction: Correction, index: int
+) -> None:
     """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show.
 
     Raises:
         NoResultError: it is.
     """
-    capture = correction.captures[index]
-    T_mount = correction.model.T_mount
-    fitted = fit_hand_eye([capture], [correction.unconstrained[index]], T_mount)
-    if not beyond_any_arm(session, *hand_eye_difference(capture, T_mount, fitted.T_mount)):
+    capture, views = correction.captures[index], correction.unconstrained[index]
+    fitted = fit_hand_eye([capture], [views], correction.model.T_mount)
+    if not beyond_any_arm(session, *hand_eye_difference(capture, correction.model.T_mount, fitted.T_mount)):
         return
-    # Unconstrained views that start far off have not converged, which would count as scatter: once more from there.
-    unconstrained = unconstrained_poses(capture, capture.poses(fitted.T_mount), correction.overlaps[index].gate)
-    fitted = fit_hand_eye([capture], [unconstrained], fitted.T_mount)
-    turn, shift = hand_eye_difference(capture, T_mount, fitted.T_mount)
-    xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
-    distance = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi)
-    if distance > chi2_limit(_HAND_EYE_CHANCE, 6) and beyond_any_arm(session, turn, shift):
-        by = f"{shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad"
+    found = hand_eye_transfer(measurement, capture, views, correction.model)
+    if found.p_value < _HAND_EYE_CHANCE and beyond_any_arm(session, found.turn, found.distance):
+        by = f"{found.distance:.3g} {session.length_unit} and {1e3 * found.turn:.3g} mrad"
         raise NoResultError(f"{session.path}: {sentence('hand-eye of another set-up', by=by)}")
 
 

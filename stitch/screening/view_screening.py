@@ -172,7 +172,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
     capture = correction.captures[index]
     T_mount = correction.geometry.T_mount
     if correction.given:
-        require_matching_hand_eye(session, correction, index)
+        require_matching_hand_eye(session, measurement, correction, index)
     snooping = _snoop_session(session, measurement, correction, index)
     if stock := find_stock(session, capture, T_mount, snooping):
         return ViewScreening(stock=stock)
