@@ -1,8 +1,8 @@
 """How near all views come together under the poses of a hypothesis, with the best hand-eye: by centroids, by surfaces.
 
 The centroid of a view leans to the side that it sees, by about as much in every view: under right poses the centroids
-meet within some hundredths of the part's size, under wrong ones within about all of it. That is where surfaces begin,
-which judge.
+meet within some hundredths of the part's size, under wrong ones within about all of it. That is a first, cheap judge:
+all hypotheses and starts are minimised side by side (Levenberg 1944; Marquardt 1963). Surfaces judge the best few.
 Parts that look alike from several sides, such as plates with holes, close pair by pair in wrong ways, so that too few
 motions agree under any hypothesis. All views at once close under the right one alone.
 """
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stitch.fit.coarse import SCORE_SHARE, icp_from_starts
@@ -21,8 +20,10 @@ from stitch.screening.hypotheses import Hypothesis
 from stitch.screening.motions import MotionFit
 from stitch.session.capture import Capture, part_size
 
-# Rotations that centroids begin with, and how often one is tried from there; what poses that turn less do not show.
-_STARTS, _EVALUATIONS, _SEEN = 12, 200, 1e-6
+# Hand-eyes that centroids begin with, and steps from there.
+_STARTS, _CENTROID_STEPS = 12, 40
+# Problems minimised at a time: memory.
+_BATCH = 4000
 # Another hypothesis is refuted by the surfaces if it leaves this much more between them. Under rows in any order, where
 # none is right, the best of 58 readings led by 1.12 at most (four views) and by 1.04 (seven to twelve); right ones led
 # by 1.4 to 2.0 where all views overlap, by less where they go all round a part: there the motions decide.
@@ -60,10 +61,10 @@ def hypotheses_by_surface(capture: Capture, ranked: Sequence[MotionFit]) -> tupl
         T = fit.hypothesis.T_base_flange
         scaled = frames.make(T[:, :3, :3], fit.scale * T[:, :3, 3])
         posed.append(replace(fit.hypothesis, T_base_flange=scaled))
-    centroids = np.array([scan.points.mean(axis=0) for scan in capture.scans])
+    by_centroids = fit_centroids(posed, np.array([scan.points.mean(axis=0) for scan in capture.scans]))
     as_stated, *others = [
-        surface_misfit(capture, h, [fit_centroids(h, centroids), fit.T_mount])
-        for h, fit in zip(posed, tried, strict=True)
+        surface_misfit(capture, h, [T_mount, fit.T_mount])
+        for h, (_, T_mount), fit in zip(posed, by_centroids, tried, strict=True)
     ]
     best, *others = sorted(others, key=lambda fit: fit.misfit)
     if not best.meets or best.misfit * CLEARLY_BETTER > as_stated.misfit:
@@ -88,26 +89,70 @@ def surface_misfit(capture: Capture, hypothesis: Hypothesis, starts: Sequence[Ar
     return SurfaceFit(hypothesis, best.T_mount, best.score, True)
 
 
-def fit_centroids(hypothesis: Hypothesis, centroids: Array) -> Array:
-    """Return the hand-eye (4, 4) under which the placed centroids come closest to their mean.
-
-    Under each rotation the best translation is a linear answer (variable projection: Golub and Pereyra 1973).
+def fit_centroids(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
+    """Return per hypothesis the rms distance of the placed centroids from their mean, and the hand-eye (4, 4).
 
     Args:
         centroids: (V, 3) of the scans, scanner frame.
     """
-    used = slice(None) if hypothesis.used is None else list(hypothesis.used)
-    R, position = hypothesis.T_reference_mount[used, :3, :3], hypothesis.T_reference_mount[used, :3, 3]
-    shifted = (R - R.mean(axis=0)).reshape(-1, 3)
-    inverse = np.linalg.pinv(shifted, _SEEN)
+    per_batch = max(_BATCH // _STARTS, 1)
+    batches = [tried[i : i + per_batch] for i in range(0, len(tried), per_batch)]
+    return [fit for batch in batches for fit in _fit_batch(batch, centroids)]
 
-    def left(turn: Array) -> Array:
-        placed = frames.rotate(R, Rotation.from_rotvec(turn).apply(centroids[used])[:, None])[:, 0] + position
-        off = (placed - placed.mean(axis=0)).ravel()
-        return np.concatenate([off - shifted @ (inverse @ off), -inverse @ off])
 
+def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
+    count, views = len(tried), len(centroids)
+    poses = np.repeat(np.array([h.T_reference_mount for h in tried]), _STARTS, axis=0)
+    used = np.ones((count, views))
+    for i, h in enumerate(tried):
+        if h.used is not None:
+            used[i] = np.isin(np.arange(views), h.used)
+    share = np.repeat(used / used.sum(axis=1, keepdims=True), _STARTS, axis=0)
     # Random, yet the same in every run.
-    starts = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_rotvec()
-    ends = [least_squares(lambda turn: left(turn)[:-3], start, method="lm", max_nfev=_EVALUATIONS) for start in starts]
-    turn = min(ends, key=lambda end: float(end.cost)).x
-    return frames.make(Rotation.from_rotvec(turn).as_matrix(), left(turn)[-3:])
+    starts = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_matrix()
+    X = frames.make(np.tile(starts, (count, 1, 1)), np.zeros(3))
+    X[:, :3, 3] = _best_translation(poses, X, centroids, share)
+    cost = np.einsum("pv,pvi->p", share, _centroid_residual(poses, X, centroids, share) ** 2)
+    damping = np.full(len(X), 1e-3)
+    for _ in range(_CENTROID_STEPS):
+        step = _centroid_step(poses, X, centroids, share, damping)
+        new = X @ frames.exp(step)
+        new_cost = np.einsum("pv,pvi->p", share, _centroid_residual(poses, new, centroids, share) ** 2)
+        better = new_cost < cost
+        X = np.where(better[:, None, None], new, X)
+        cost = np.where(better, new_cost, cost)
+        damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-9, 1e6)
+    cost = cost.reshape(count, _STARTS)
+    best = np.argmin(cost, axis=1)
+    return [(float(np.sqrt(cost[i, b])), X[i * _STARTS + b]) for i, b in enumerate(best)]
+
+
+def _centroid_residual(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
+    """(P, V, 3) placed centroids about their mean."""
+    placed = frames.transform(poses @ X[:, None], centroids[None, :, None])[:, :, 0]
+    return placed - np.einsum("pv,pvi->pi", share, placed)[:, None]
+
+
+def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
+    """(P, 3) that brings the centroids closest together while the rotations stay."""
+    R = poses[..., :3, :3]
+    M = R - np.einsum("pv,pvij->pij", share, R)[:, None]
+    r = _centroid_residual(poses, X, centroids, share)
+    normal = np.einsum("pv,pvki,pvkj->pij", share, M, M) + 1e-9 * np.eye(3)
+    right = np.einsum("pv,pvki,pvk->pi", share, M, r)
+    return -np.linalg.solve(normal, right[..., None])[..., 0]
+
+
+def _centroid_step(poses: Array, X: Array, centroids: Array, share: Array, damping: Array) -> Array:
+    """(P, 6) right twists of the hand-eyes."""
+    R = (poses @ X[:, None])[..., :3, :3]
+    J = np.concatenate([-R @ frames.skew(centroids)[None], R], axis=3)
+    J = J - np.einsum("pv,pvij->pij", share, J)[:, None]
+    r = _centroid_residual(poses, X, centroids, share)
+    normal = np.einsum("pv,pvki,pvkj->pij", share, J, J, optimize=True)
+    right = np.einsum("pv,pvki,pvk->pi", share, J, r, optimize=True)
+    # Damped by its own diagonal: rotations and translations have scales of their own.
+    diagonal = np.einsum("pii->pi", normal)
+    floor = 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12
+    damped = normal + (damping[:, None] * diagonal + floor)[:, :, None] * np.eye(6)
+    return -np.linalg.solve(damped, right[..., None])[..., 0]
