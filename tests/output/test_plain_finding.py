@@ -23,6 +23,14 @@ from stitch.output.plain_words import effect_in_words
 from stitch.screening.pose_tests import PoseStep
 
 
+def finding(verdict, *effects, **more):
+    """A certain diagnosis in a session without doubts; `more` says what is otherwise."""
+    candidates = [SimpleNamespace(name=name, cross_validation=None) for name in effects]
+    usual = {"laws": (), "rival_trend": "", "doubts": (), "dropped_before": None, "certain": True, "curves": ()}
+    usual |= {"likelier_than_not": True, "time_curve": None, "candidates": candidates, "effects": effects}
+    return SimpleNamespace(verdict=verdict, **usual | more)
+
+
 def test_every_effect_of_the_library_has_words():
     library = [effect.name for effect in EFFECTS.values() if effect.tier == "physical"]
     said = [effect_in_words(name) for name in library]
@@ -37,19 +45,8 @@ def test_every_effect_of_the_library_has_words():
 def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve, follows_field):
     """No formula is looked for of what the scanner itself errs by."""
     monkeypatch.setattr("stitch.output.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
-    found = SimpleNamespace(
-        verdict=verdict,
-        laws=(),
-        rival_trend="",
-        curves=curves,
-        time_curve=time_curve,
-        doubts=(),
-        dropped_before=None,
-        linear=None,
-        candidates=(),
-        likelier_than_not=True,
-        follows_field=follows_field,
-    )
+    more = {"curves": curves, "time_curve": time_curve, "linear": None, "follows_field": follows_field}
+    found = finding(verdict, **more)
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
     explained = verdict == "unknown_effect" and bool(curves or time_curve) and not follows_field
@@ -62,19 +59,8 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     for module in (plain, validation):
         monkeypatch.setattr(module, "group_share", lambda linear, group: (share, 0.05))
     cause = SimpleNamespace(name="play", ranked=SimpleNamespace(score=None))
-    found = SimpleNamespace(
-        verdict="cannot_tell",
-        laws=(),
-        rival_trend="",
-        effects=("play",),
-        candidates=(cause,),
-        doubts=(),
-        dropped_before=None,
-        certain=True,
-        likelier_than_not=True,
-        sentence="",
-        linear=SimpleNamespace(measurement=SimpleNamespace(length_unit="mm")),
-    )
+    linear = SimpleNamespace(measurement=SimpleNamespace(length_unit="mm"))
+    found = finding("cannot_tell", "play", candidates=(cause,), sentence="", linear=linear)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: pytest.fail("it is added"))
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
@@ -86,17 +72,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 def test_no_model_is_built_on_a_doubtful_session(verdict):
-    found = SimpleNamespace(
-        verdict=verdict,
-        laws=(),
-        rival_trend="",
-        effects=("backlash",),
-        curves=("of joint 3",),
-        time_curve=None,
-        doubts=("knocked",),
-        dropped_before=None,
-        likelier_than_not=True,
-    )
+    found = finding(verdict, "backlash", curves=("of joint 3",), doubts=("knocked",))
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command == "stitch review RUN" and refused(command) is None
 
@@ -108,17 +84,7 @@ def test_no_model_is_built_on_a_doubtful_session(verdict):
 def test_a_step_that_is_named_is_no_doubt_beside_it(moved, distinguishable, further, named):
     """The step and the effect are one sentence; a scanner that was knocked is no slip of the part, and none is it."""
     step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
-    found = SimpleNamespace(
-        verdict="missing_effect",
-        laws=(),
-        rival_trend="",
-        effects=(named,),
-        candidates=(SimpleNamespace(name=named, cross_validation=None),),
-        doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
-        dropped_before=None,
-        certain=True,
-        likelier_than_not=True,
-    )
+    found = finding("missing_effect", named, doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further))
     same = distinguishable and named == ("part_slip" if moved == "part" else "mount_step")
     told, command = plain_finding(found, "mm"), suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert (f"{named} (from view c on the {moved} sits elsewhere, " in told) == same
@@ -132,18 +98,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     same = FieldError(0.017, 0.0, 9.0, over_noise=False)
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
-        found = SimpleNamespace(
-            verdict="adequate",
-            laws=(),
-            rival_trend="",
-            effects=(),
-            scanner_error=smooth,
-            doubts=(),
-            dropped_before=None,
-            certain=True,
-            likelier_than_not=True,
-        )
-        assert said in plain_finding(found, "mm")
+        assert said in plain_finding(finding("adequate", scanner_error=smooth), "mm")
 
 
 @pytest.mark.parametrize(
@@ -156,18 +111,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
 )
 def test_a_name_that_may_be_chance_is_no_statement(odds, said):
     """20 to 1 over nothing, as over every other name."""
-    candidate = SimpleNamespace(name="settling", cross_validation=None)
-    found = SimpleNamespace(
-        verdict="missing_effect",
-        laws=(),
-        rival_trend="",
-        effects=("settling",),
-        candidates=(candidate,),
-        doubts=(),
-        dropped_before=None,
-        log_odds_over_nothing=np.log(odds),
-        beyond_belief=(),
-    )
+    found = finding("missing_effect", "settling", log_odds_over_nothing=np.log(odds), beyond_belief=())
     found.certain = Diagnosis.certain.fget(found)
     found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)
     told = plain_finding(found, "mm")
@@ -186,18 +130,8 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
 def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
     """Of 20 µm of scatter a small effect moves the residual by less than chance does, either way."""
     left = CrossValidation(inside=inside, heldout=1.0, poses=poses, poses_sigma=0.1, steadiness=0.9)
-    found = SimpleNamespace(
-        verdict="missing_effect",
-        laws=(),
-        rival_trend="",
-        effects=("settling",),
-        candidates=(SimpleNamespace(name="settling", cross_validation=left),),
-        doubts=(),
-        dropped_before=None,
-        certain=True,
-        likelier_than_not=True,
-        residual_rms=0.04,
-    )
+    found = finding("missing_effect", "settling", residual_rms=0.04)
+    found.candidates[0].cross_validation = left
     told = plain_finding(found, "mm")
     assert said in told and ("reduce the error" in told) == (inside < 1)
 
@@ -217,18 +151,11 @@ def _found(
         for share, seen in ((posterior, True), (posterior * 3 / 97, False))
     )
     candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
-    return SimpleNamespace(
-        verdict=verdict,
-        laws=(),
-        rival_trend="",
-        effects=("play",) if verdict == "missing_effect" else (),
-        candidates=(candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None)),
-        certain=certain,
-        log_odds_over_nothing=np.log(3),
-        depends_on=(SimpleNamespace(p_value=p_value),),
-        repeating_errors=(),
-        implausible=False,
-    )
+    effects = ("play",) if verdict == "missing_effect" else ()
+    candidates = (candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None))
+    more = {"depends_on": (SimpleNamespace(p_value=p_value),), "repeating_errors": (), "implausible": False}
+    odds = np.log(3)
+    return finding(verdict, *effects, candidates=candidates, certain=certain, log_odds_over_nothing=odds, **more)
 
 
 @pytest.mark.parametrize(
@@ -262,7 +189,7 @@ def test_the_screen_says_how_sure_it_is(found, said):
 )
 def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
     follows = (SimpleNamespace(covariate="j2_deg", p_value=1e-9),)
-    found = SimpleNamespace(verdict="unknown_effect", laws=(), curves=curves, depends_on=follows, follows_field=False)
+    found = finding("unknown_effect", curves=curves, depends_on=follows, follows_field=False)
     assert remedy_at_machine(found) == f"At the machine: {said}"
     for by_view, told in ((False, "At the machine: have the scanner calibrated."), (True, "")):
         found.follows_field, found.scanner_error = True, SimpleNamespace(by_view=by_view)
