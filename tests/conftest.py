@@ -86,9 +86,9 @@ def stitch_command():
 
     def call(*arguments: object) -> str:
         out = io.StringIO()
-        with redirect_stdout(out), pytest.raises(SystemExit) as ended:
+        with redirect_stdout(out), pytest.raises(SystemExit) as stop:
             main([str(a) for a in arguments])
-        assert not ended.value.code
+        assert not stop.value.code
         return out.getvalue()
 
     return call

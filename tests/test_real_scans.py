@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from stitch.api.pipeline import diagnose, run, run_rig
-from stitch.cli.main import main
 from stitch.model.model_toml import read_model
 from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.session.capture import prepare_capture
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 # Minutes of work: `make check` runs it, `make test` does not.
 pytestmark = pytest.mark.slow
@@ -75,13 +75,11 @@ def test_pose_errors_learned_on_one_object_repeat_on_another(reghec, runs, name)
     assert after < 0.1 * before
 
 
-def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
+def test_command_line_end_to_end(reghec, tmp_path, monkeypatch):
     """Session in, run folder out; its hand-eye serves another object."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(reghec("rubik")), "--json"])
-    assert ended.value.code == 0
-    result = json.loads(capsys.readouterr().out)
+    told = ended("run", reghec("rubik"), "--json")
+    result = json.loads(told.out)
     folder = tmp_path / "runs" / "reghec-rubik"
     assert result == json.loads((folder / "result.json").read_text())
     names = {path.name for path in folder.iterdir()}
@@ -96,9 +94,7 @@ def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
     }
     assert (result["format"], result["reference_frame"], result["length_unit"]) == ("stitch-run/1", "base", "mm")
     assert [s["name"] for s in result["stages"]] == ["coarse", "correct", "register", "fuse"]
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(reghec("cone")), "--hand-eye", str(folder), "-o", "cone", "--no-recording"])
-    assert ended.value.code == 0
+    ended("run", reghec("cone"), "--hand-eye", folder, "-o", "cone", "--no-recording")
     assert np.allclose(read_model(tmp_path / "cone").T_mount, read_model(folder).T_mount)
     assert not (tmp_path / "cone" / "recording.rrd").exists()
 
@@ -115,9 +111,7 @@ def test_diagnosis_of_a_real_object_says_how_poses_scatter_and_that_joints_are_n
 def test_the_centre_of_a_sphere_says_nothing_of_how_its_surface_turns(runs, reghec, tmp_path):
     """The sphere with its own centre as a labelled point: no view is taken for turned, and the hand-eye stays."""
     folder = shutil.copytree(reghec("sphere"), tmp_path / "sphere")
-    with pytest.raises(SystemExit) as ended:
-        main(["detect", str(folder), "--ball", "any", "-o", str(folder / "points.csv")])
-    assert not ended.value.code
+    ended("detect", folder, "--ball", "any", "-o", folder / "points.csv")
     with_centre = run(load_session(folder))
     assert not with_centre.left_out
     apart = frames.log(frames.inverse(runs["sphere"].model.T_mount) @ with_centre.model.T_mount)

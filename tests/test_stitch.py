@@ -33,7 +33,6 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
-from stitch.cli.main import main
 from stitch.diagnosis.diagnosis import Proposal
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.errors import InputError, NoResultError, did_you_mean
@@ -45,6 +44,7 @@ from stitch.plugins.metrology.planning.plan import Plan
 from stitch.plugins.watch.report import Change
 from stitch.system.values import Value
 from tests.api.test_api import HELD
+from tests.command_line import ended
 
 # How the docstring of a function begins.
 VERBS = {"Compute", "Find", "Fit", "Read", "Return", "Stitch", "Write"}
@@ -483,12 +483,10 @@ def test_a_name_that_is_like_none_suggests_none():
     assert did_you_mean("xyz", ["joint_offsets", "range_scale"]) == ""
 
 
-def test_the_command_line_prints_the_fix_to_type(capsys, monkeypatch):
+def test_the_command_line_prints_the_fix_to_type(monkeypatch):
     def fails(*_):
         raise InputError("there already", fix_cli="state --force", fix_python="pass force=True")
 
     monkeypatch.setattr("stitch.cli.main.build", lambda: fails)
-    with pytest.raises(SystemExit) as end:
-        main([])
-    assert end.value.code == 2
-    assert capsys.readouterr().err.strip() == "stitch: there already; to fix: state --force"
+    told = ended(code=2)
+    assert told.err.strip() == "stitch: there already; to fix: state --force"

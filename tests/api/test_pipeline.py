@@ -19,7 +19,6 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api.pipeline import change, run
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.fit import surface_steps
 from stitch.fusion.fuse import RegisteredSession, fuse_every_point
@@ -31,6 +30,7 @@ from stitch.output.stored_run import load_run
 from stitch.recorder import RecorderMemory, SilentRecorder
 from stitch.session.reading.session_folder import load_session
 from stitch.system.threads import begin
+from tests.command_line import ended
 from viz.recording import run_markdown
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 4e-4, 2e-3, 0])
@@ -131,9 +131,7 @@ def test_a_method_of_another_name_is_bad_input(session):
         InputError, match="register icp: no method has this name; did you mean .gicp.*to fix: dpwvm, gicp or vmm"
     ):
         run(load_session(session), register="icp")
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "--register", "icp"])
-    assert ended.value.code == 2
+    ended("run", session, "--register", "icp", code=2)
 
 
 def test_from_python_the_method_is_that_of_the_command(session):
@@ -201,10 +199,7 @@ def test_what_cannot_be_kept_is_refused_in_one_line(tmp_path, stitch_command, mo
     folder = write_labelled(tmp_path / "s", labelled_cell(0, views=8)[0])
     stitch_command("run", folder, "-o", "r", "--no-recording")
     capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        main(["run", str(folder), "-o", "q", *arguments])
-    assert stop.value.code == 2
-    line = capsys.readouterr().err
+    line = ended("run", folder, "-o", "q", *arguments, code=2).err
     assert told in line and line.count("\n") == 1
     assert not (tmp_path / "q").exists()
 

@@ -17,6 +17,7 @@ from stitch.cli.main import build, main
 from stitch.cli.options import complete_effect
 from stitch.effects import EFFECTS
 from stitch.system.packages import stitch_version
+from tests.command_line import ended
 
 
 def commands(group, words=()):
@@ -67,9 +68,7 @@ def test_the_cheap_examples_run(line, session, tmp_path, monkeypatch):
     (tmp_path / "runs").mkdir()
     bare_run(tmp_path / "runs" / "blade-17", np.eye(4), np.eye(6))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(shlex.split(line)[1:])
-    assert not ended.value.code
+    ended(*shlex.split(line)[1:])
 
 
 def test_version_is_the_package_s(capsys):
@@ -104,12 +103,10 @@ def test_the_tab_key_knows_effects_and_goes_on_behind_a_comma():
     assert complete_effect("nothing") == []
 
 
-def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
+def test_run_takes_the_session_one_stands_in(session, monkeypatch):
     monkeypatch.chdir(session)
-    with pytest.raises(SystemExit) as ended:
-        main(["run", "--no-recording"])
-    told = capsys.readouterr().out
-    assert not ended.value.code and (session.parent / "runs" / session.name / "result.json").is_file()
+    told = ended("run", "--no-recording").out
+    assert (session.parent / "runs" / session.name / "result.json").is_file()
     assert sorted(path.name for path in session.iterdir()) == ["clouds", "session.toml", "views.csv"]
     # What a person needs at the end: the hand-eye with U and its frame, errors, files, what to do next.
     assert re.search(
@@ -124,29 +121,22 @@ def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
     assert "\x1b" not in told and "\r" not in told  # quiet where nobody watches
 
 
-def test_run_without_a_session_says_so(tmp_path, monkeypatch, capsys):
+def test_run_without_a_session_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(["run"])
-    assert (
-        ended.value.code == 2 and "this folder has no session.toml; to fix: name a session" in capsys.readouterr().err
-    )
+    told = ended("run", code=2)
+    assert "this folder has no session.toml; to fix: name a session" in told.err
 
 
-def test_the_folder_of_raw_scans_is_no_session_and_becomes_one_by_init(tmp_path, capsys):
+def test_the_folder_of_raw_scans_is_no_session_and_becomes_one_by_init(tmp_path):
     (tmp_path / "my scans").mkdir()
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(tmp_path / "my scans")])
-    assert ended.value.code == 2
-    assert "session.toml: not found; a session is a folder" in (told := capsys.readouterr().err)
+    printed = ended("run", tmp_path / "my scans", code=2)
+    assert "session.toml: not found; a session is a folder" in (told := printed.err)
     assert f"`stitch init '{tmp_path}/my scans'`" in told
 
 
-def test_the_library_of_effects_is_printed_as_json(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["effects", "part_slip", "--json"])
-    assert not ended.value.code
-    (told,) = json.loads(capsys.readouterr().out)
+def test_the_library_of_effects_is_printed_as_json():
+    printed = ended("effects", "part_slip", "--json")
+    (told,) = json.loads(printed.out)
     assert told["effect"] == "part_slip" and [p["unit"] for p in told["parameters"]] == ["rad", "view"]
 
 
@@ -160,11 +150,8 @@ def of_my_own(points, view, k):
 
 
 @pytest.mark.parametrize(("name", "expected"), [("mine.txt", "mine.py"), ("mine.py", "'of_my_own' has no docstring")])
-def test_effects_that_cannot_be_loaded_are_refused(tmp_path, capsys, name, expected):
+def test_effects_that_cannot_be_loaded_are_refused(tmp_path, name, expected):
     (tmp_path / name).write_text(USER)
-    with pytest.raises(SystemExit) as ended:
-        main(["effects", "--effects-file", str(tmp_path / name)])
-    assert ended.value.code == 2
-    printed = capsys.readouterr().err
+    printed = ended("effects", "--effects-file", tmp_path / name, code=2).err
     assert printed.startswith(f"stitch: {tmp_path / name}: ") and expected in printed and printed.count("\n") == 1
     assert "of_my_own" not in EFFECTS

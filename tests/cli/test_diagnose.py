@@ -21,10 +21,10 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session, write_truth
 from stitch.cli.change import remarks
 from stitch.cli.compare import show_comparison
-from stitch.cli.main import main
 from stitch.cli.next_view import next_view_row, write_program
 from stitch.errors import InputError
 from stitch.output.stored_run import load_run
+from tests.command_line import ended
 from tests.output.comparison.compared_views import compared
 
 STATE = SimpleNamespace(
@@ -104,10 +104,9 @@ def test_a_model_with_an_effect_is_used_compared_and_undone(session_on_disk, sti
 def test_bad_use_ends_in_one_line(session_on_disk, capsys, arguments, words):
     folder = session_on_disk
     capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        main([a.replace("RUN", str(folder / "r0")).replace("SESSION", str(folder / "s")) for a in arguments])
-    assert stop.value.code == 2
-    line = capsys.readouterr().err.strip()
+    line = ended(
+        *[a.replace("RUN", str(folder / "r0")).replace("SESSION", str(folder / "s")) for a in arguments], code=2
+    ).err.strip()
     assert "\n" not in line
     assert all(word in line for word in words)
 

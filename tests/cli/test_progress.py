@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from stitch.cli import progress as live_line
-from stitch.cli.main import main
 from stitch.cli.progress import TimeLeft, time_left_text
 from stitch.errors import InputError
 from stitch.system import process
 from stitch.system.process import steps, watched
 from stitch.system.threads import parallel
+from tests.command_line import ended
 
 
 @pytest.fixture
@@ -145,12 +145,10 @@ def test_a_note_stays_in_the_ledger_when_the_model_changes(run_folder, stitch_co
 
 
 @pytest.mark.parametrize("words", [["  "], ["x" * 2001], ["fine", "--step", "9"]], ids=["empty", "long", "no step"])
-def test_a_note_that_cannot_be_kept_changes_nothing(run_folder, words, capsys):
+def test_a_note_that_cannot_be_kept_changes_nothing(run_folder, words):
     before = (run_folder / "ledger.json").read_bytes()
-    with pytest.raises(SystemExit) as ended:
-        main(["note", str(run_folder), *words])
-    assert ended.value.code == InputError.exit_code
-    assert capsys.readouterr().err.startswith("stitch: ")
+    told = ended("note", run_folder, *words, code=InputError.exit_code)
+    assert told.err.startswith("stitch: ")
     assert (run_folder / "ledger.json").read_bytes() == before
 
 

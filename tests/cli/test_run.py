@@ -24,6 +24,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.write import write_session
 from stitch.cli.main import build, main
 from stitch.system.files import rewrite_folder, whole_file
+from tests.command_line import ended
 
 KINDS = {
     "exchanged", "shifted", "reversed", "inverse", "mount", "euler", "degrees", "quaternion", "unit", "scale",
@@ -31,49 +32,39 @@ KINDS = {
 }  # fmt: skip
 
 
-def test_check_reads_all_and_reports_each(session, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["check", str(session), str(session / "nowhere"), "--json"])
-    assert ended.value.code == 2
-    document = json.loads(capsys.readouterr().out)
+def test_check_reads_all_and_reports_each(session):
+    told = ended("check", session, session / "nowhere", "--json", code=2)
+    document = json.loads(told.out)
     assert document["sessions"][0]["views"] == 3
     assert "nowhere" in document["errors"][0]
 
 
 def test_usage_is_exit_2():
     for arguments in (["run"], ["run", "x", "--no-such-option"], ["fly"]):
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == 2
+        ended(*arguments, code=2)
 
 
 def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
     keep = tmp_path / "mine"
     keep.mkdir()
     (keep / "thesis.txt").write_text("all of it")
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(keep)])
-    assert ended.value.code == 2
+    ended("run", session, "-o", keep, code=2)
     assert [path.name for path in keep.iterdir()] == ["thesis.txt"]
 
 
-def test_a_run_cannot_take_the_place_of_the_folder_one_stands_in(session, tmp_path, monkeypatch, capsys):
+def test_a_run_cannot_take_the_place_of_the_folder_one_stands_in(session, tmp_path, monkeypatch):
     monkeypatch.setattr("stitch.api.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "inner")
     for target in (".", "..", tmp_path / "here" / "inner"):
-        with pytest.raises(SystemExit) as ended:
-            main(["run", str(session), "-o", str(target)])
-        assert ended.value.code == 2
-        assert f"stitch: {target}: " in capsys.readouterr().err
+        told = ended("run", session, "-o", target, code=2)
+        assert f"stitch: {target}: " in told.err
     assert sorted(path.name for path in tmp_path.rglob("here/**/*")) == ["inner"]
 
 
-def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["batch", str(tmp_path / "nowhere"), "-o", str(tmp_path / "runs")])
-    assert ended.value.code == 2
-    assert "nowhere" in capsys.readouterr().err
+def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path):
+    told = ended("batch", tmp_path / "nowhere", "-o", tmp_path / "runs", code=2)
+    assert "nowhere" in told.err
 
 
 @pytest.mark.parametrize(
@@ -85,11 +76,9 @@ def test_a_batch_of_sessions_that_cannot_be_read_is_bad_input(tmp_path, capsys):
         ("900 MiB", "memory: 0.9 GB are too little"),
     ],
 )
-def test_memory_that_is_no_size_or_too_little_is_refused(session, tmp_path, capsys, size, said):
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(tmp_path / "r"), "--memory", size])
-    assert ended.value.code == 2
-    assert re.search(said, capsys.readouterr().err)
+def test_memory_that_is_no_size_or_too_little_is_refused(session, tmp_path, size, said):
+    told = ended("run", session, "-o", tmp_path / "r", "--memory", size, code=2)
+    assert re.search(said, told.err)
     assert not (tmp_path / "r").exists()
 
 
@@ -110,17 +99,14 @@ def test_a_mesh_may_be_of_a_kind_and_takes_no_session_for_one(words, sessions, k
     assert [str(path) for path in context.params["sessions"]] == sessions and context.params["mesh"] == kind
 
 
-def test_a_mesh_for_which_open3d_is_missing_is_refused_before_the_work(session, tmp_path, monkeypatch, capsys):
+def test_a_mesh_for_which_open3d_is_missing_is_refused_before_the_work(session, tmp_path, monkeypatch):
     monkeypatch.setattr("stitch.api.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh", "watertight"])
-    assert ended.value.code == 2
+    told = ended("run", session, "-o", tmp_path / "run", "--mesh", "watertight", code=2)
     missing = "stitch: --mesh watertight: Open3D is not installed; to fix: pip install 'stitch-scans[open3d]'"
-    assert missing in capsys.readouterr().err
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh=smooth"])
-    assert ended.value.code == 2 and "--mesh smooth: to fix" in capsys.readouterr().err
+    assert missing in told.err
+    told = ended("run", session, "-o", tmp_path / "run", "--mesh=smooth", code=2)
+    assert "--mesh smooth: to fix" in told.err
     assert not (tmp_path / "run").exists()
 
 
@@ -199,11 +185,9 @@ def test_every_command_works_on_a_session_of_clouds_and_labelled_points(tmp_path
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="nobody may make a folder in /proc")
-def test_the_folder_that_was_asked_for_is_named(session, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", "/proc/xx"])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err.strip().startswith("stitch: /proc/xx: No such file or directory; to fix: name")
+def test_the_folder_that_was_asked_for_is_named(session):
+    told = ended("run", session, "-o", "/proc/xx", code=2)
+    assert told.err.strip().startswith("stitch: /proc/xx: No such file or directory; to fix: name")
 
 
 def test_the_file_that_was_asked_for_is_named(tmp_path):

@@ -153,7 +153,7 @@ from stitch.cli.main import main
 for line in (["run", "s", "-o", "r"], ["compare", "r"], ["report", "r", "--no-diagnosis"]):
     try:
         main(line)
-    except SystemExit as ended:
+    except SystemExit as stop:
         if ended.code:
             raise
 """

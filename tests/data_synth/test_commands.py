@@ -21,6 +21,7 @@ from stitch.cli import change, diagnose, run, terminal
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 
 def test_every_scene_of_the_project_is_read_and_has_a_part():
@@ -93,11 +94,10 @@ def test_mistakes_in_a_scene_are_named(small, old, new, says):
         (["reveal", "OUT", "truth.json"], "truth.json: not found"),
     ],
 )
-def test_command_line_ends_in_one_line_and_exit_code_2(arguments, says, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main([str(tmp_path / "out") if a == "OUT" else a for a in arguments])
-    assert ended.value.code == 2 and list(tmp_path.iterdir()) == []
-    lines = capsys.readouterr().err.strip().splitlines()
+def test_command_line_ends_in_one_line_and_exit_code_2(arguments, says, tmp_path):
+    told = ended(*[str(tmp_path / "out") if a == "OUT" else a for a in arguments], code=2)
+    assert list(tmp_path.iterdir()) == []
+    lines = told.err.strip().splitlines()
     assert len(lines) == 1 and says in lines[0]
 
 
@@ -238,12 +238,10 @@ def test_a_folder_that_is_no_demo_stays(tmp_path):
     assert (tmp_path / "mine" / "precious.txt").is_file()
 
 
-def test_reveal_prints_json_alone(tmp_path, capsys):
+def test_reveal_prints_json_alone(tmp_path):
     judged(tmp_path, diagnosis=NAMED)
-    with pytest.raises(SystemExit) as ended:
-        main(["reveal", str(tmp_path / "run"), str(tmp_path / "truth.json"), "--json"])
-    assert ended.value.code == 0
-    assert json.loads(capsys.readouterr().out)["judgement"] == "right"
+    told = ended("reveal", tmp_path / "run", tmp_path / "truth.json", "--json")
+    assert json.loads(told.out)["judgement"] == "right"
 
 
 def test_people_read_what_was_hidden_once_and_with_units(tmp_path, capsys):

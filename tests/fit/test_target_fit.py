@@ -12,7 +12,6 @@ from scipy.stats import chi2
 from data_synth.fixtures.labelled_arm import PROBE_TURN, TARGETS, Growth, flange, labelled_cell, random_pose
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api.pipeline import diagnose, run, run_rig
-from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
 from stitch.fit.target_fit import LinearisedTargets, TargetSession
@@ -23,6 +22,7 @@ from stitch.observations.targets.rows import initial_landmarks
 from stitch.output.json_file import to_json
 from stitch.output.result_document import model_of, result_document
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 OFFSET = np.array([0, 1e-3, -0.7e-3, 0, 0.8e-3, 0])
 
@@ -214,21 +214,17 @@ def test_other_arms_and_other_kinds_are_refused(days):
         run_rig([sessions[0], other])
 
 
-def test_the_command_writes_a_folder_a_session_and_an_arm_to_keep(days, tmp_path, capsys):
+def test_the_command_writes_a_folder_a_session_and_an_arm_to_keep(days, tmp_path):
     sessions, _ = days
     folders = [write_labelled(tmp_path / name, s) for name, s in zip(("one", "two"), sessions, strict=True)]
     out = tmp_path / "both"
-    with pytest.raises(SystemExit) as stop:
-        main(["run", *map(str, folders), "-o", str(out), "--effects", "joint_offset", "--no-recording", "--json"])
-    assert not stop.value.code
-    documents = json.loads(capsys.readouterr().out)
+    told = ended("run", *folders, "-o", out, "--effects", "joint_offset", "--no-recording", "--json")
+    documents = json.loads(told.out)
     assert documents[0]["effects"] == documents[1]["effects"]
     assert documents[0]["hand_eye"] != documents[1]["hand_eye"]
     third = write_labelled(tmp_path / "three", labelled_cell(22, views=24, offset=OFFSET)[0])
-    with pytest.raises(SystemExit) as stop:
-        main(["run", str(third), "-o", str(tmp_path / "r"), "--arm", str(out), "--no-recording", "--json"])
-    assert not stop.value.code
-    kept = json.loads(capsys.readouterr().out)
+    told = ended("run", third, "-o", tmp_path / "r", "--arm", out, "--no-recording", "--json")
+    kept = json.loads(told.out)
     assert kept["residual_rms"] < 0.5 * run(labelled_cell(22, views=24, offset=OFFSET)[0]).residual_rms
 
 

@@ -35,6 +35,7 @@ from stitch.output.stored_run import diagnosed_state, load_run, trusted_model
 from stitch.recorder import SilentRecorder
 from stitch.run_data import LedgerStep
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 from viz import run_page
 from viz.page_parts import sections_of, with_sections
 from viz.run_page import write_report
@@ -107,21 +108,19 @@ def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
     assert again.residual_rms == runs[1].residual_rms and again.heldout_rms == runs[1].heldout_rms
 
 
-def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path, capsys):
+def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path):
     run = tmp_path / "r"
     run.mkdir()
     for name, data in files(folder / "r").items():
         (run / name).write_bytes(data)
     k = repr(told(run)["effects"][EFFECT]["k"]["value"])
     (run / "model.toml").write_text((run / "model.toml").read_text().replace(k, "1e-5"))
-    with pytest.raises(SystemExit) as stop:
-        main(["report", str(run)])
-    line = capsys.readouterr().err.strip()
-    assert stop.value.code == 2 and "\n" not in line and "model.toml: changed after the run" in line
+    line = ended("report", run, code=2).err.strip()
+    assert "\n" not in line and "model.toml: changed after the run" in line
     assert files(run)["report.html"] == files(folder / "r")["report.html"]
 
 
-def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monkeypatch, capsys, stitch_command):
+def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monkeypatch, stitch_command):
     """The page keeps what it said, and nothing is added where it names nothing; of another state it is forgotten."""
     run, page = tmp_path / "r", tmp_path / "r" / "report.html"
     run.mkdir()
@@ -286,9 +285,7 @@ def test_residuals_with_gaps_in_the_times_and_covariates_named_like_columns(sess
     rows = (session / "views.csv").read_text().splitlines()
     more = ("time_s,residual,nx", "0,5,7", ",6,", "9,5,8")
     (session / "views.csv").write_text("\n".join(f"{a},{b}" for a, b in zip(rows, more, strict=True)) + "\n")
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(tmp_path / "run"), "--no-recording"])
-    assert not ended.value.code
+    ended("run", session, "-o", tmp_path / "run", "--no-recording")
     table = read_table(tmp_path / "run" / "residuals.parquet")
     assert sorted(set(table.column_names)) == sorted(table.column_names)
     columns = {name: np.array(values) for name, values in table.to_pydict().items()}

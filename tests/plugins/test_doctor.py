@@ -8,9 +8,9 @@ import pytest
 import stitch
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.cli.main import main
 from stitch.plugins import doctor
 from stitch.system.packages import PACKAGES, command_for
+from tests.command_line import ended
 
 
 @pytest.fixture
@@ -19,11 +19,9 @@ def without_laspy(monkeypatch):
     monkeypatch.setattr(doctor, "installed", lambda name: None if name == "laspy" else "1.0")
 
 
-def said(capsys, *arguments):
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", *map(str, arguments)])
-    assert not ended.value.code
-    return capsys.readouterr().out
+def said(*arguments):
+    told = ended("doctor", *arguments)
+    return told.out
 
 
 def test_json_lists_all_packages(without_laspy, capsys):
@@ -65,10 +63,9 @@ def test_a_run_says_which_versions_were_others(tmp_path, monkeypatch, capsys):
     assert f"{tmp_path}: computed with stitch 0.0.9; here is 1.0" in " ".join(said(capsys, tmp_path).split())
 
 
-def test_a_folder_without_a_run_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", str(tmp_path)])
-    assert ended.value.code == 2 and "name a run folder that `stitch run` wrote" in capsys.readouterr().err
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    told = ended("doctor", tmp_path, code=2)
+    assert "name a run folder that `stitch run` wrote" in told.err
 
 
 def test_a_bundle_holds_the_numbers_of_a_run_and_no_clouds(tmp_path, capsys):
@@ -78,9 +75,7 @@ def test_a_bundle_holds_the_numbers_of_a_run_and_no_clouds(tmp_path, capsys):
     names = set(ZipFile(tmp_path / "bundle.zip").namelist())
     assert {"doctor.json", "run/model.toml", "run/result.json", "run/ledger.json", "session/session.toml"} <= names
     assert not any(name.endswith((".ply", ".parquet", ".html", ".rrd", "points.csv")) for name in names)
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", str(run), "-o", str(tmp_path / "bundle.zip")])
-    assert ended.value.code == 2
+    ended("doctor", run, "-o", tmp_path / "bundle.zip", code=2)
 
 
 def test_what_a_small_install_needs_is_json_where_that_is_asked_for(capsys):

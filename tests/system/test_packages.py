@@ -16,7 +16,6 @@ import pytest
 import stitch
 from bench.licences import brought, complaints, kind, licence
 from stitch.api.run import Stitched
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.system import open3d_library
 from stitch.system.packages import (
@@ -31,6 +30,7 @@ from stitch.system.packages import (
     stitch_version,
     unless_missing,
 )
+from tests.command_line import ended
 from tests.needs import needs_open3d
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -160,7 +160,7 @@ def test_open3d_is_no_dependency_of_the_base():
         ("cv2.aruco", "needs opencv-python-headless, which is not installed (boards in scans, lenses that distort, "),
     ],
 )
-def test_a_package_that_an_import_misses_is_one_line_of_the_command(module, line, monkeypatch, capsys):
+def test_a_package_that_an_import_misses_is_one_line_of_the_command(module, line, monkeypatch):
     error = ModuleNotFoundError(f"No module named {module!r}", name=module)
     assert missing_package(error).startswith(line)
 
@@ -168,9 +168,8 @@ def test_a_package_that_an_import_misses_is_one_line_of_the_command(module, line
         raise error
 
     monkeypatch.setattr("stitch.cli.main.build", lacks)
-    with pytest.raises(SystemExit) as ended:
-        main(["run"])
-    assert ended.value.code == 2 and capsys.readouterr().err.startswith(f"stitch: {line}")
+    told = ended("run", code=2)
+    assert told.err.startswith(f"stitch: {line}")
     assert missing_package(ModuleNotFoundError("no", name="stitch.nothing")) is None
 
 
@@ -286,11 +285,10 @@ def said(request, monkeypatch):
         ("--with open3d", ["compare", "run", "--with", "open3d"]),
     ],
 )
-def test_a_command_says_what_is_missing_before_the_work(words, line, said, session, tmp_path, monkeypatch, capsys):
+def test_a_command_says_what_is_missing_before_the_work(words, line, said, session, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main([str(session) if word == "SESSION" else word for word in line])
-    assert ended.value.code == 2 and f"stitch: {words}: {said}" in capsys.readouterr().err
+    told = ended(*[str(session) if word == "SESSION" else word for word in line], code=2)
+    assert f"stitch: {words}: {said}" in told.err
     assert not (tmp_path / "run").exists()
 
 

@@ -304,8 +304,8 @@ def said(capsys, *words):
     """What a command says to people, as one line."""
     try:
         main([str(word) for word in words])
-    except SystemExit as ended:
-        assert not ended.code
+    except SystemExit as stop:
+        assert not stop.code
     printed = capsys.readouterr()
     return " ".join(f"{printed.err} {printed.out}".split())
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.two_runs import HandEyeChange, compare_runs, comparison_sentence
+from tests.command_line import ended
 from tests.in_browser import WAYS, require_for_everybody, shown
 from viz.two_runs_page import facts, view_change_rows, write_two_runs
 
@@ -135,7 +135,7 @@ def test_everybody_can_read_and_reach_the_page(browser, file, way):
     require_for_everybody(browser, file, way)
 
 
-def test_bad_folders_end_in_one_line(tmp_path, capsys):
+def test_bad_folders_end_in_one_line(tmp_path):
     for words, told in (
         (["report", tmp_path, tmp_path / "none"], "damaged|no such run folder|name a run folder"),
         (["report", tmp_path, tmp_path], "are one run"),
@@ -146,10 +146,7 @@ def test_bad_folders_end_in_one_line(tmp_path, capsys):
         ),
         (["report", tmp_path, tmp_path / "b", "--diagnosis"], "^stitch: --diagnosis: .*to fix: leave --diagnosis"),
     ):
-        with pytest.raises(SystemExit) as ended:
-            main([str(word) for word in words])
-        error = capsys.readouterr().err
-        assert ended.value.code == 2
+        error = ended(*words, code=2).err
         assert re.search(told, error)
         assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())

@@ -15,7 +15,6 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
-from stitch.cli.main import main
 from stitch.diagnosis.dependence import FOLLOWS, also_clear, dependences, equally_clear
 from stitch.diagnosis.systematic_laws import STEP
 from stitch.numerics import frames
@@ -28,6 +27,7 @@ from stitch.output.comparison.residual_tables import (
     property_varies,
     view_statistics,
 )
+from tests.command_line import ended
 from tests.diagnosis.freed_blade import freed_blade
 from tests.needs import needs_open3d
 from tests.output.comparison.compared_views import compared
@@ -298,12 +298,10 @@ def test_the_side_that_is_nearer_to_the_truth_is_named(cell, witnessed_run, witn
     assert any(line.startswith("Open3D is nearer in") for line in worse.sentences("mm"))
 
 
-def test_compare_with_open3d_writes_the_witness_and_says_what_differs(witnessed_run, witness, tmp_path, capsys):
+def test_compare_with_open3d_writes_the_witness_and_says_what_differs(witnessed_run, witness, tmp_path):
     folder = witnessed_run.save(tmp_path / "run", recording=False)
-    with pytest.raises(SystemExit) as ended:
-        main(["compare", str(folder), "--with", "open3d"])
-    assert not ended.value.code
-    told = " ".join(capsys.readouterr().out.split())
+    printed = ended("compare", folder, "--with", "open3d")
+    told = " ".join(printed.out.split())
     assert "registered the same scans by" in told and "From its cloud to this one: half within" in told
     document = json.loads((folder / "witness.json").read_text())
     assert [row["view"] for row in document["views"]] == list(witness.views)
@@ -313,9 +311,8 @@ def test_compare_with_open3d_writes_the_witness_and_says_what_differs(witnessed_
     assert (folder / "witness.png").stat().st_size > 10_000
 
 
-def test_where_open3d_is_missing_one_line_says_so(tmp_path, monkeypatch, capsys):
+def test_where_open3d_is_missing_one_line_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     for program, said in (("open3d", "Open3D is not installed"), ("pcl", "--with pcl: to fix: open3d")):
-        with pytest.raises(SystemExit) as ended:
-            main(["compare", str(tmp_path), "--with", program])
-        assert ended.value.code == 2 and said in capsys.readouterr().err
+        told = ended("compare", tmp_path, "--with", program, code=2)
+        assert said in told.err

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells.base_to_base import read_stand, solve_stand
 from stitch.plugins.cells.stand import DhArm, Stand, TouchedPoints, compare_distances, fit_stand, project
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.robot import forward, jacobian
+from tests.command_line import ended
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "base_to_base.toml"
 DRAWS = 1000
@@ -190,17 +190,15 @@ def test_command(capsys):
     assert np.allclose(np.array(document["T_base1_base2"])[:3, 3], [4, -1, 1], atol=1e-3)
 
 
-def test_command_refuses_with_exit_code_1(tmp_path, capsys):
+def test_command_refuses_with_exit_code_1(tmp_path):
     text = EXAMPLE.read_text(encoding="utf-8")
     second = {"0.6826": "1.1305", "0.7897": "1.1772", "length = 4.0\n": "length = 5.0\n", "4.4084": "5.5555"}
     for old, new in (*second.items(), ("3.8822", "5.9093"), ("0.4488", "0.6283")):
         text = text.replace(old, new)
     (tmp_path / "two.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(SystemExit) as stop:
-        main(["base", str(tmp_path / "two.toml")])
-    assert stop.value.code == 1
+    told = ended("base", tmp_path / "two.toml", code=1)
     by_rod = np.sqrt(25 + 5.5555**2 - 2 * 5 * 5.5555 * np.cos(1.1772 - 1.1305))
-    message = capsys.readouterr().err
+    message = told.err
     assert "contradict" in message and f"{1.4 * np.sin(0.6283) - by_rod:+.4f} m" in message
 
 
@@ -362,9 +360,7 @@ def test_a_wrong_height_shows_in_the_chi_square():
 
 
 def main_(arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 0
+    ended(*arguments)
 
 
 JOINTS_EXAMPLE = EXAMPLE.with_name("base_to_base_joints.toml")

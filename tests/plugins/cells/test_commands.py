@@ -31,6 +31,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.plugins.cells import job_files
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 from tests.in_browser import WAYS, require_for_everybody
 from viz.cells.page import job_identity
 from viz.page_parts import unbroken
@@ -226,15 +227,13 @@ def test_the_hash_of_a_job_is_that_of_all_it_names(tmp_path):
     assert first == same != other == by_hand.hexdigest()[:16]
 
 
-def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monkeypatch, capsys):
+def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monkeypatch):
     """R2 read 0.2 m short of where its rod puts it."""
     text = JOBS["base"].read_text()
     (tmp_path / "bad.toml").write_text(text.replace("length = 4.4084", "length = 4.2084"))
     assert text != (tmp_path / "bad.toml").read_text()
     monkeypatch.setattr(job_files, "entry_points", lambda group, name: [Offer(viz.cells.base_to_base.write_page)])
-    with pytest.raises(SystemExit) as stop:
-        main(["base", str(tmp_path / "bad.toml"), "--report", str(tmp_path / "page.html")])
-    assert stop.value.code == 1
+    ended("base", tmp_path / "bad.toml", "--report", tmp_path / "page.html", code=1)
     assert "no transform is given" in (tmp_path / "page.html").read_text()
 
 
@@ -267,11 +266,9 @@ def test_a_fit_is_where_the_part_stands_and_serves_the_seam(handed_out, tmp_path
     assert {row["verdict"] for row in seams} == {"good"}
 
 
-def test_session_never_overwrites(handed_out, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(JOBS["drill"]), "--session", str(handed_out / "drill")])
-    assert stop.value.code == 2
-    assert "exists already; name another folder" in capsys.readouterr().err
+def test_session_never_overwrites(handed_out):
+    told = ended("drill", JOBS["drill"], "--session", handed_out / "drill", code=2)
+    assert "exists already; name another folder" in told.err
 
 
 def test_page_into_a_missing_folder_is_refused(tmp_path, monkeypatch):

@@ -36,6 +36,7 @@ from stitch.plugins.cells.drilling_sensors import (
     to_plane,
     undistort,
 )
+from tests.command_line import ended
 
 
 def random_pose(rng):
@@ -313,14 +314,12 @@ def test_drilling_experiment_reaches_the_published_errors():
     assert good.mean() >= 0.95
 
 
-def test_job_from_files(tmp_path, capsys):
+def test_job_from_files(tmp_path):
     """Drives written to CSV bring the holes within the published 0.30 mm; both effects are named."""
     cell = DrillingCell(1, Sizes(k1=-0.004, plate_height=0.3))
     T = write_job(tmp_path, cell)
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(tmp_path / "job.toml"), "-o", str(tmp_path / "drives.csv"), "--json"])
-    assert stop.value.code == 0
-    document = json.loads(capsys.readouterr().out)
+    told = ended("drill", tmp_path / "job.toml", "-o", tmp_path / "drives.csv", "--json")
+    document = json.loads(told.out)
     assert {t["effect"] for t in document["camera_effects"] if t["accepted"]} == {"k1", "plate_height"}
     assert frames.angle_between(np.array(document["T_measuring_base"]), T) < 1e-3
     rows = np.genfromtxt(tmp_path / "drives.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -358,15 +357,13 @@ def pictured_job(tmp_path_factory):
     return folder
 
 
-def test_pictures_of_holes_give_the_drives_of_their_pixels(tmp_path, pictured_job, capsys):
+def test_pictures_of_holes_give_the_drives_of_their_pixels(tmp_path, pictured_job):
     """Pixels of 0.04 mm, pictures good to 0.2 pixels, and no lens error: a few 0.01 mm between both ways."""
     cell = DrillingCell(1)
     write_job(tmp_path, cell)
     by_pixels = solve_drill_job(read_drill_job(tmp_path / "job.toml"))
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(pictured_job / "job.toml"), "--json"])
-    assert stop.value.code == 0
-    drives = json.loads(capsys.readouterr().out)["drives"]
+    told = ended("drill", pictured_job / "job.toml", "--json")
+    drives = json.loads(told.out)["drives"]
     for seen, d in zip(drives, by_pixels.drives, strict=True):
         assert np.linalg.norm(np.array(seen["position"]) - d.position) < 0.05
         T = frames.make(d.rotation, np.array(seen["position"]))
@@ -479,7 +476,7 @@ def test_two_reference_holes_are_too_few(tmp_path):
         solve_drill_job(read_drill_job(tmp_path / "job.toml"))
 
 
-def test_locating_holes_give_the_plate_in_the_flange_frame(tmp_path, capsys):
+def test_locating_holes_give_the_plate_in_the_flange_frame(tmp_path):
     """Axes of joints from markers of 0.02 mm: at the flange 1.25 m away the plate is off by up to 0.3 mm."""
     cell = DrillingCell(2)
     T = write_job(tmp_path, cell)
@@ -585,13 +582,10 @@ def test_servo_drives_the_cell_to_the_published_errors(driven_job, capsys):
         assert position <= 0.30 and direction <= 0.21
 
 
-def test_what_a_servo_command_prints_is_checked(driven_job, capsys):
+def test_what_a_servo_command_prints_is_checked(driven_job):
     folder, _ = driven_job
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(folder / "job.toml"), "--servo", "echo 12"])
-    message = capsys.readouterr().err
-    assert stop.value.code == 1 and "hole 101" in message and '"uv": [u, v]' in message
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(folder / "job.toml"), "--servo", "no-such-program"])
-    assert stop.value.code == 2 and "write a program" in capsys.readouterr().err
+    message = ended("drill", folder / "job.toml", "--servo", "echo 12", code=1).err
+    assert "hole 101" in message and '"uv": [u, v]' in message
+    told = ended("drill", folder / "job.toml", "--servo", "no-such-program", code=2)
+    assert "write a program" in told.err
     assert not (folder / "placed.csv").exists()

@@ -38,6 +38,7 @@ from stitch.plugins.cells.panel_model import (
     shape_step,
     true_flanges,
 )
+from tests.command_line import ended
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "panel"
 LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
@@ -349,16 +350,13 @@ def main_code(arguments):
         ('"flanges.csv"', '"none.csv"', "none.csv: not found"),
     ],
 )
-def test_bad_job_is_refused_in_one_line(tmp_path, capsys, old, new, message):
+def test_bad_job_is_refused_in_one_line(tmp_path, old, new, message):
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     text = (EXAMPLE / "job.toml").read_text()
     assert old in text
     (tmp_path / "job.toml").write_text(text.replace(old, new))
-    with pytest.raises(SystemExit) as stop:
-        main(["panel", str(tmp_path / "job.toml")])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
+    error = ended("panel", tmp_path / "job.toml", code=2).err
     assert message in error
     assert error.count("\n") == 1
 

@@ -14,7 +14,6 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape, car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.shapes.casting import around, with_stock
-from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import tukey
@@ -36,6 +35,7 @@ from stitch.plugins.cells.scan_to_cad import AllowancePrior, allowance_sentence,
 from stitch.plugins.cells.seam import Limits, Station, measure_seam
 from stitch.session.scan import prepare_scan
 from stitch.session.session import Cloud
+from tests.command_line import ended
 
 FREE, VARYING = AllowancePrior(free=True), AllowancePrior(free=True, varying=True)
 STOCK = 0.3
@@ -202,11 +202,8 @@ def test_other_words_are_refused(text):
         read_allowance(text)
 
 
-def test_the_command_refuses_in_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(tmp_path / "any.toml"), "--allowance", "much"])
-    assert stop.value.code == 2
-    shown = capsys.readouterr()
+def test_the_command_refuses_in_one_line(tmp_path):
+    shown = ended("fit", tmp_path / "any.toml", "--allowance", "much", code=2)
     assert shown.out == ""
     assert shown.err.count("\n") == 1
 

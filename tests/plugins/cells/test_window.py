@@ -25,6 +25,7 @@ from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_de
 from stitch.plugins.cells.seam import Limits, Station, find_edge, measure_seam
 from stitch.plugins.cells.window import correct_path
 from stitch.session.scan import prepare_scan
+from tests.command_line import ended
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "window"
 NOISE = 0.05
@@ -210,16 +211,13 @@ def test_path_follows_the_part():
         ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
     ],
 )
-def test_bad_job_is_refused_in_one_line(tmp_path, capsys, command, name, old, new, message):
+def test_bad_job_is_refused_in_one_line(tmp_path, command, name, old, new, message):
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     text = (EXAMPLE / name).read_text()
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new))
-    with pytest.raises(SystemExit) as stop:
-        main([command, str(tmp_path / name)])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
+    error = ended(command, tmp_path / name, code=2).err
     assert message in error
     assert error.count("\n") == 1
 
@@ -359,14 +357,11 @@ def test_seam_is_that_of_the_meshes(placed):
     ],
 )
 @pytest.mark.slow
-def test_bad_scans_are_refused_in_one_line(placed, capsys, old, new, message):
+def test_bad_scans_are_refused_in_one_line(placed, old, new, message):
     folder, _, _ = placed
     text = (folder / "window.toml").read_text()
     assert old in text
     (folder / "bad.toml").write_text(text.replace(old, new))
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(folder / "bad.toml")])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
+    error = ended("fit", folder / "bad.toml", code=2).err
     assert message in error
     assert error.count("\n") == 1

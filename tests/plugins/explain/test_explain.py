@@ -16,7 +16,6 @@ from data_synth import kinematics
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api.pipeline import run
-from stitch.cli.main import main
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.effects.contract import EFFECTS, missing_need
 from stitch.effects.user_file import load
@@ -28,6 +27,7 @@ from stitch.plugins.explain.quantities import Quantity, backlash_lag, nonlinear_
 from stitch.plugins.explain.search import search_sums
 from stitch.session.measurement import views_of
 from stitch.session.torques import no_torques
+from tests.command_line import ended
 from tests.diagnosis.freed_blade import freed_blade
 
 SIZE = 3e-4  # rad
@@ -127,19 +127,14 @@ def test_the_file_that_is_written_can_be_added(tmp_path, stitch_command, monkeyp
     assert told["tested_formula"] == told["formula"]
     assert after["effects"]["explained"]["a"]["value"] == pytest.approx(SIZE, rel=0.1)
     # A second one by that name would take the first one's place unseen.
-    with pytest.raises(SystemExit) as stop:
-        main(["explain", "r", "--effects-file", "mine.py"])
-    assert stop.value.code == 2
+    ended("explain", "r", "--effects-file", "mine.py", code=2)
 
 
 @pytest.mark.parametrize(("output", "told"), [("mine.txt", "mine.py"), ("there.py", "exists already")])
-def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch, capsys, output, told):
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch, output, told):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.py").write_text("# mine\n")
-    with pytest.raises(SystemExit) as stop:
-        main(["explain", "r", "-o", output])
-    assert stop.value.code == 2
-    line = capsys.readouterr().err
+    line = ended("explain", "r", "-o", output, code=2).err
     assert told in line and line.count("\n") == 1
     assert (tmp_path / "there.py").read_text() == "# mine\n"
 

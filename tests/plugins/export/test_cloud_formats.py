@@ -9,9 +9,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from data_synth.fixtures.run_folders import bare_run
-from stitch.cli.main import main
 from stitch.output.run_folder import write_cloud
 from stitch.run_data import FusedCloud
+from tests.command_line import ended
 from tests.needs import needs
 
 RNG = np.random.default_rng(0)
@@ -28,9 +28,7 @@ def cloud(request, tmp_path):
     write_cloud(FusedCloud(POINTS, NORMALS, RESIDUAL, np.full(300, 2)), run / "stitched.ply")
 
     def export(kind):
-        with pytest.raises(SystemExit) as ended:
-            main(["export", str(run), "--to", kind, "-o", str(tmp_path / f"c.{kind}")])
-        assert not ended.value.code
+        ended("export", run, "--to", kind, "-o", tmp_path / f"c.{kind}")
         return str(tmp_path / f"c.{kind}")
 
     return export, {"mm": 1e-3, "m": 1.0}[request.param]
@@ -133,14 +131,13 @@ def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
         ("las", "c.las", "cloud", "needs the package laspy; to fix: pip install 'stitch-scans[formats]'"),
     ],
 )
-def test_clouds_that_cannot_be_written(kind, output, content, message, tmp_path, monkeypatch, capsys):
+def test_clouds_that_cannot_be_written(kind, output, content, message, tmp_path, monkeypatch):
     run = bare_run(tmp_path / "r", np.eye(4), np.eye(6))
     if content == "cloud":
         write_cloud(FusedCloud(POINTS, NORMALS, RESIDUAL, np.full(300, 2)), run / "stitched.ply")
     elif content is not None:
         (run / "stitched.ply").write_bytes(content)
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
-    with pytest.raises(SystemExit) as ended:
-        main(["export", str(run), "--to", kind, "-o", str(tmp_path / output)])
-    assert ended.value.code == 2 and message in capsys.readouterr().err
+    told = ended("export", run, "--to", kind, "-o", tmp_path / output, code=2)
+    assert message in told.err
     assert [path.name for path in tmp_path.iterdir()] == ["r"]

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.run_folders import bare_run
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run
+from tests.command_line import ended
 
 NUMBER = r"(-?\d+\.\d+)"
 COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 0.02, 0.05, 0.04]) ** 2
@@ -65,9 +65,7 @@ def test_opencv_reads_its_own_storage(tmp_path):
     cv2 = pytest.importorskip("cv2")
     file = tmp_path / "hand_eye.yaml"
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE, name='blade "17"')
-    with pytest.raises(SystemExit) as ended:
-        main(["export", str(run), "--to", "opencv", "-o", str(file)])
-    assert not ended.value.code
+    ended("export", run, "--to", "opencv", "-o", file)
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
     assert np.array_equal(storage.getNode("T_flange_scanner").mat(), ANYWHERE)
     assert np.array_equal(storage.getNode("covariance").mat(), COVARIANCE)
@@ -200,14 +198,12 @@ def test_what_an_unseen_effect_could_do_leaves_with_the_numbers(tmp_path):
         (["--to", "ros", "-o", "no/scanner.yaml"], "no/scanner.yaml: there is no folder no; to fix: make it"),
     ],
 )
-def test_bad_requests_write_nothing(arguments, message, tmp_path, monkeypatch, capsys):
+def test_bad_requests_write_nothing(arguments, message, tmp_path, monkeypatch):
     run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE)
     monkeypatch.chdir(tmp_path)
     Path("taken.yaml").write_text("mine")
-    with pytest.raises(SystemExit) as ended:
-        main(["export", str(run), *arguments])
-    out = capsys.readouterr()
-    assert ended.value.code == 2 and message in out.err and not out.out
+    out = ended("export", run, *arguments, code=2)
+    assert message in out.err and not out.out
     assert Path("taken.yaml").read_text() == "mine" and len(list(tmp_path.iterdir())) == 2
 
 

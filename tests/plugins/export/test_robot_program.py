@@ -30,6 +30,7 @@ from stitch.plugins.intake.controllers.taught_points import program_bytes
 from stitch.plugins.metrology.calibrate.arm_model import ArmModel
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.torques import torques_of
+from tests.command_line import ended
 from tests.plugins.intake.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 ARM = ARMS["KUKA KR30-3"]
@@ -333,13 +334,12 @@ def test_what_is_too_large_or_out_of_reach_is_refused(tmp_path):
         ),
     ],
 )
-def test_refused_commands_write_nothing(stated, arguments, message, tmp_path, monkeypatch, capsys):
+def test_refused_commands_write_nothing(stated, arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "w.script").write_text(program("ur", JOINTS, []))
     (tmp_path / "w.ls").write_text(program("fanuc", JOINTS, []))
-    with pytest.raises(SystemExit) as ended:
-        main(["export", str(stated), *arguments])
-    assert ended.value.code == 2 and message in capsys.readouterr().err
+    told = ended("export", stated, *arguments, code=2)
+    assert message in told.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["w.ls", "w.script"]
 
 

@@ -17,10 +17,10 @@ JOINTS = "j1 j2 j3 j4 j5 j6\n0.1 0.2 0.3 0.4 0.5 0.6\n0.2 0.2 0.3 0.4 0.5 0.6\n"
 def imported(tmp_path, capsys):
     def call(name, text, *flags):
         (tmp_path / name).write_text(text, encoding="utf-8")
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as stop:
             main(["import", str(tmp_path / name), *flags])
         printed = capsys.readouterr()
-        return ended.value.code or 0, list(csv.DictReader(io.StringIO(printed.out))), printed.err
+        return stop.value.code or 0, list(csv.DictReader(io.StringIO(printed.out))), printed.err
 
     return call
 

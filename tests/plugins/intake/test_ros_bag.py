@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.plugins.intake.ros_bag import TransformTree, find_bag, write_bag_session
 from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 rosbag1, rosbag2 = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")
@@ -238,11 +238,10 @@ def test_a_view_for_each_stop_with_pose_joints_and_hand_eye(tmp_path, kind, orga
     assert (image is None) != organised
 
 
-def test_a_camera_that_stands_in_the_cell(tmp_path, capsys):
+def test_a_camera_that_stands_in_the_cell(tmp_path):
     bag = write(tmp_path / "b", "ros2", urdf=False, camera_fixed=True)
-    with pytest.raises(SystemExit) as end:
-        main(["init", str(bag)])
-    assert not end.value.code and "mount: eye_to_hand" in capsys.readouterr().out
+    told = ended("init", bag)
+    assert "mount: eye_to_hand" in told.out
     session = load_session(tmp_path / "b-session")
     assert session.mount == "eye_to_hand" and session.joints is None
     assert session.views[1].T_base_flange[:3, 3] == pytest.approx(1000 * flange(STOPS[1])[:3, 3], abs=1e-4)
@@ -296,22 +295,18 @@ def bag(tmp_path_factory):
         (("--frames", "base_link,tool9"), "tf has no tool9"),
     ],
 )
-def test_what_a_bag_does_not_have_is_refused_in_one_line(bag, tmp_path, capsys, arguments, told):
-    with pytest.raises(SystemExit) as end:
-        main(["init", str(bag), "-o", str(tmp_path / "s"), *arguments])
-    printed = capsys.readouterr()
-    assert end.value.code == 2 and told in printed.err and len(printed.err.strip().splitlines()) == 1
+def test_what_a_bag_does_not_have_is_refused_in_one_line(bag, tmp_path, arguments, told):
+    printed = ended("init", bag, "-o", tmp_path / "s", *arguments, code=2)
+    assert told in printed.err and len(printed.err.strip().splitlines()) == 1
     assert not (tmp_path / "s").exists()
 
 
-def test_broken_bags_end_in_one_line(tmp_path, capsys):
+def test_broken_bags_end_in_one_line(tmp_path):
     (tmp_path / "b.bag").write_bytes(b"#ROSBAG V2.0\nnothing")
     (tmp_path / "b.mcap").write_bytes(b"nothing")
     for name in ("b.bag", "b.mcap"):
-        with pytest.raises(SystemExit) as end:
-            main(["init", str(tmp_path / name)])
-        told = capsys.readouterr().err
-        assert end.value.code == 2 and "cannot be read as a bag" in told and len(told.strip().splitlines()) == 1
+        told = ended("init", tmp_path / name, code=2).err
+        assert "cannot be read as a bag" in told and len(told.strip().splitlines()) == 1
 
 
 def test_a_bag_alone_in_a_folder_is_found_and_one_of_two_is_not(tmp_path):

@@ -41,6 +41,7 @@ from stitch.plugins.watch.exported import dfq_text, openmetrics
 from stitch.plugins.watch.history import open_history
 from stitch.plugins.watch.report import cell_report, cell_trend, headline
 from stitch.plugins.watch.update import append_runs
+from tests.command_line import ended
 from viz.watch.cell_page import light
 
 MOVED = np.array([0.15, 0.0, -0.08])  # mm, frame of the sensor: how the mount jumped
@@ -135,13 +136,11 @@ def test_a_mount_that_jumped_is_found_from_run_folders(tmp_path, capsys):
     days, cell = 9, tmp_path / "cell"
     for k in range(days):
         session, _ = session_of_day(tmp_path / f"d{k}", k, moved=k >= 6)
-        with pytest.raises(SystemExit) as ended:
-            main(["run", str(session), "-o", str(tmp_path / f"r{k}"), "--no-recording"])
-        assert not ended.value.code
-        with pytest.raises(SystemExit) as ended:
+        ended("run", session, "-o", tmp_path / f"r{k}", "--no-recording")
+        with pytest.raises(SystemExit) as stop:
             main(["watch", str(cell), "--add", str(tmp_path / f"r{k}"), "--at", f"2026-03-{k + 1:02d}T08:00", "--json"])
         told = json.loads(capsys.readouterr().out)
-        assert (ended.value.code or 0) == (3 if k >= 7 else 0)
+        assert (stop.value.code or 0) == (3 if k >= 7 else 0)
     moved = {p["name"]: p["alarm"] for p in told["parameters"] if p["alarm"]}
     assert all(alarm["since"] == "d6" and alarm["kind"] == "step" for alarm in moved.values())
     assert all(name.startswith("hand_eye.") for name in moved)

@@ -32,9 +32,9 @@ def run_folder(folder: Path, name: str, shift: float = 0.0, c2: float = 1e-6) ->
 
 
 def ends(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as stop:
         main([str(a) for a in arguments])
-    return int(ended.value.code or 0)
+    return int(stop.value.code or 0)
 
 
 def test_a_knock_ends_with_3_and_its_session(tmp_path, capsys):

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from data_synth.fixtures.edits import edit, set_cell
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
 from stitch.output.stored_run import read_ledger, read_result
@@ -37,6 +36,7 @@ from stitch.session.reading.session_toml import (
 from stitch.session.reading.target_tables import read_frames, read_points
 from stitch.session.reading.text_files import read_text, require_folder_name, require_name
 from stitch.session.reading.views_table import read_views
+from tests.command_line import ended
 
 
 def test_a_good_session_is_read_whole(session):
@@ -148,7 +148,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input_is_one_line_exit_2_and_leaves_nothing(session, tmp_path, capsys, name):
+def test_bad_input_is_one_line_exit_2_and_leaves_nothing(session, tmp_path, name):
     spoil, expected = BAD[name]
     spoil(session)
     with pytest.raises(InputError) as error:
@@ -156,11 +156,9 @@ def test_bad_input_is_one_line_exit_2_and_leaves_nothing(session, tmp_path, caps
     assert "\n" not in str(error.value)
     for piece in expected:
         assert piece in str(error.value), str(error.value)
-    with pytest.raises(SystemExit) as ended:
-        main(["run", str(session), "-o", str(tmp_path / "out" / "run")])
-    assert ended.value.code == 2
+    told = ended("run", session, "-o", tmp_path / "out" / "run", code=2)
     assert not (tmp_path / "out").exists()
-    printed = capsys.readouterr()
+    printed = told
     assert printed.out == ""
     assert printed.err.strip() == f"stitch: {error.value}"
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stitch.cli.main import main
 from stitch.errors import InputError
+from tests import command_line
 from tests.viz.review.conftest import ended, served, until
 from viz.review import rerun_viewer
 from viz.review.jobs import Jobs
@@ -230,7 +230,7 @@ def test_a_fit_that_is_ended_leaves_the_run_as_it_was(server, run, how):
     assert not list(run.parent.glob(".r.stitch-*"))
 
 
-def test_what_is_no_run_and_a_taken_port_end_in_a_line(run, server, tmp_path, capsys):
+def test_what_is_no_run_and_a_taken_port_end_in_a_line(run, server, tmp_path):
     port = server.place.partition(":")[2]
     for words in (
         [tmp_path / "none"],
@@ -238,10 +238,7 @@ def test_what_is_no_run_and_a_taken_port_end_in_a_line(run, server, tmp_path, ca
         [run, "--port", port],
         [run, "--effects-file", tmp_path / "none.py"],
     ):
-        with pytest.raises(SystemExit) as stopped:
-            main(["review", *map(str, words), "--no-browser"])
-        assert stopped.value.code == InputError.exit_code
-        told = capsys.readouterr().err
+        told = command_line.ended("review", *words, "--no-browser", code=InputError.exit_code).err
         assert told.startswith("stitch: ")
         assert told.count("\n") == 1
 

@@ -171,9 +171,9 @@ def test_command_writes_once(tmp_path, capsys):
     (tmp_path / "p.mod").write_text(ABB)
     target = tmp_path / "views.csv"
     for code in (0, 2):
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as stop:
             cli.main(["import", str(tmp_path / "p.mod"), "-o", str(target)])
-        assert ended.value.code == code
+        assert stop.value.code == code
     assert "7 rows of views.csv" in (text := capsys.readouterr().err) and "exists already" in text
     assert target.read_text().startswith("view,j1_deg,")
 

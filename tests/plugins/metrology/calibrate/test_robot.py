@@ -20,7 +20,6 @@ from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
 from stitch.api.pipeline import change, run
-from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
 from stitch.model.forward import corrected_capture
@@ -45,6 +44,7 @@ from stitch.session.reading.robot_description import robot_from_dh, robot_from_u
 from stitch.session.reading.session_folder import load_session
 from stitch.session.robot import forward
 from stitch.session.session import StatedRepeatability
+from tests.command_line import ended
 
 OFFSET = np.array([0, 1.2e-3, -1.5e-3, 0, 1e-3, 0])
 SAG = 1.5e-6  # rad/mm: gravity, which no table holds
@@ -109,13 +109,11 @@ def test_rows_without_a_sighting_prove_nothing():
     assert (found.heldout_rms, found.nominal_rms) == pytest.approx((alone.heldout_rms, alone.nominal_rms), rel=1e-3)
 
 
-def test_the_command_says_what_the_table_is_worth_and_writes_it(tmp_path, capsys, few_effects):
+def test_the_command_says_what_the_table_is_worth_and_writes_it(tmp_path, few_effects):
     session, *_ = labelled_cell(11, views=60, offset=OFFSET, sag=SAG)
     folder = write_labelled(tmp_path / "s", session)
-    with pytest.raises(SystemExit) as stop:
-        main(["calibrate", "robot", str(folder), "-o", str(tmp_path / "out"), "--json"])
-    assert not stop.value.code
-    table = json.loads(capsys.readouterr().out)["table"]
+    told = ended("calibrate", "robot", folder, "-o", tmp_path / "out", "--json")
+    table = json.loads(told.out)["table"]
     assert table["effects"] == ["joint_offset"] and table["heldout_rms"] < table["nominal_heldout_rms"]
     text = (tmp_path / "out" / "robot.toml").read_text()
     assert f"# {table['sentence']}\n" in text and "# Proved for j1 -6" in text
@@ -127,13 +125,11 @@ def test_the_command_says_what_the_table_is_worth_and_writes_it(tmp_path, capsys
     assert np.abs(forward(read.robot, session.joints) - forward(session.robot, session.joints)).max() > 0.1
 
 
-def test_calibrate_robot_writes_rows_and_urdf_of_the_same_arm(tmp_path, capsys, few_effects):
+def test_calibrate_robot_writes_rows_and_urdf_of_the_same_arm(tmp_path, few_effects):
     session, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]))
     folder = write_labelled(tmp_path / "s", session)
-    with pytest.raises(SystemExit) as stop:
-        main(["calibrate", "robot", str(folder), "-o", str(tmp_path / "out"), "--json"])
-    assert not stop.value.code
-    document = json.loads(capsys.readouterr().out)
+    told = ended("calibrate", "robot", folder, "-o", tmp_path / "out", "--json")
+    document = json.loads(told.out)
     assert document["kind"] == "robot" and len(document["robot"]) == 6 and document["next"]
     assert ElementTree.parse(tmp_path / "out" / "robot.urdf").getroot().tag == "robot"
     robot = robot_from_dh("arm", "standard", document["robot"], None, np.array([0, 0, -9.81]), "mm")
@@ -341,17 +337,13 @@ def test_a_table_that_is_worse_on_another_day_is_not_written():
     assert table.sentence("mm").startswith("The best table leaves")
 
 
-def test_the_command_says_what_was_proved_where(tmp_path, capsys, days):
+def test_the_command_says_what_was_proved_where(tmp_path, days):
     for name, seed in (("monday", 41), ("tuesday", 42)):
         write_labelled(tmp_path / name, labelled_cell(seed, views=40, offset=OFFSET)[0])
     arguments = ["calibrate", "robot", str(tmp_path / "monday"), "--on", str(tmp_path / "tuesday"), "-o"]
-    with pytest.raises(SystemExit) as stop:
-        main([*arguments, str(tmp_path / "arm")])
-    assert not stop.value.code
-    said = " ".join("".join(capsys.readouterr()).split())
+    told = ended(*arguments, tmp_path / "arm")
+    said = " ".join("".join(told).split())
     assert "On session tuesday, which took no part, it leaves" in said
     assert "The model: On session tuesday" in (tmp_path / "arm" / "robot.toml").read_text()
-    with pytest.raises(SystemExit) as stop:
-        main(["export", str(tmp_path / "arm"), "--to", "arm-dh", "--on", str(tmp_path / "tuesday")])
-    assert not stop.value.code
-    assert "On session tuesday" in " ".join("".join(capsys.readouterr()).split())
+    told = ended("export", tmp_path / "arm", "--to", "arm-dh", "--on", tmp_path / "tuesday")
+    assert "On session tuesday" in " ".join("".join(told).split())

@@ -118,9 +118,9 @@ def test_decoupled_is_exact_where_orientations_are_equal_and_absent_where_none_a
 def test_command_on_both_mounts(mount, tmp_path, capsys):
     cell = sphere_cell(5, "line", turns=0.6)
     folder = write_spheres(cell, tmp_path / "s", mount)
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as stop:
         cli.main(["calibrate", "sphere", str(folder), "--json"])
-    assert ended.value.code == 0
+    assert stop.value.code == 0
     document = json.loads(capsys.readouterr().out)
     found = np.array(document["hand_eye"])
     assert np.abs(twist(cell, found) / document["hand_eye_sigma"]).max() < 4

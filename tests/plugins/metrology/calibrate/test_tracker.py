@@ -69,9 +69,9 @@ def test_error_is_that_of_the_covariance(mount, tmp_path):
 @pytest.mark.parametrize("as_json", [True, False])
 def test_command(as_json, tmp_path, capsys):
     truth = session(tmp_path / "s", "eye_to_hand")
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as stop:
         cli.main(["calibrate", "tracker", str(tmp_path / "s"), *(["--json"] if as_json else [])])
-    assert ended.value.code == 0
+    assert stop.value.code == 0
     out = capsys.readouterr()
     if as_json:
         assert np.abs(np.array(json.loads(out.out)["hand_eye"]) - truth).max() < 0.5

@@ -8,11 +8,11 @@ import pytest
 
 import stitch
 from data_synth.cells.driven_cell import new_cell, take
-from stitch.cli.main import main
 from stitch.errors import NoResultError
 from stitch.plugins.metrology.planning import drive as driving
 from stitch.plugins.metrology.planning.drive import DrivenCell, drive
 from stitch.plugins.metrology.planning.verb import plan
+from tests.command_line import ended
 
 SEED = 2
 UNTIL = 0.6  # mm: reached with few views
@@ -78,8 +78,6 @@ def test_ctrl_c_leaves_what_was_scanned(cell, monkeypatch):
     assert rows(cell.folder) == 1
 
 
-def test_drive_and_until_u_go_together(cell, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["plan", str(cell.folder), "--drive", "true"])
-    assert ended.value.code == 2
-    assert "--until-U" in capsys.readouterr().err
+def test_drive_and_until_u_go_together(cell):
+    told = ended("plan", cell.folder, "--drive", "true", code=2)
+    assert "--until-U" in told.err

@@ -14,7 +14,6 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import Growth, labelled_cell
 from data_synth.write import write_session
-from stitch.cli.main import main
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
@@ -38,6 +37,7 @@ from stitch.plugins.metrology.planning.planned_views import with_views
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_before_any_scan_it_says_what_views_tell_and_which_to_add(planned, measu
         ("nothing", ["--size", "9"], ["session.toml"]),
     ],
 )
-def test_bad_use_ends_in_one_line(planned, tmp_path, capsys, change, options, words):
+def test_bad_use_ends_in_one_line(planned, tmp_path, change, options, words):
     folder = tmp_path / "s"
     if change == "nothing":
         folder.mkdir()
@@ -195,10 +195,8 @@ def test_bad_use_ends_in_one_line(planned, tmp_path, capsys, change, options, wo
         end = text.index("[robot]") if text.index("[robot]") > table else len(text)
         text = text[:table] + _without(text[table:end], change[0]) + text[end:]
         (folder / "session.toml").write_text(text)
-    with pytest.raises(SystemExit) as stop:
-        main(["plan", str(folder), *options, "-o", str(tmp_path / "more")])
-    assert stop.value.code == 2
-    line = capsys.readouterr().err.strip().splitlines()[-1]
+    told = ended("plan", folder, *options, "-o", tmp_path / "more", code=2)
+    line = told.err.strip().splitlines()[-1]
     assert all(word in line for word in words)
     assert not (tmp_path / "more").exists()
 

@@ -47,8 +47,8 @@ def batch():
     """stitch batch with some arguments, which ends with an exit code."""
 
     def call(*arguments, code=0):
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as stop:
             main(["batch", *map(str, arguments), "--no-recording"])
-        assert (ended.value.code or 0) == code
+        assert (stop.value.code or 0) == code
 
     return call

@@ -15,12 +15,12 @@ from pyarrow import parquet
 
 from data_synth.fixtures.edits import edit
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.output.run_folder import write_with_page
 from stitch.plugins.watch.batch import bounds, cluster, run_batch
 from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
 from stitch.plugins.watch.verb import batch as stitch_batch
+from tests.command_line import ended
 from viz.batch_page import write_page
 from viz.page_parts import unbroken
 
@@ -57,9 +57,7 @@ def test_a_model_that_was_changed_since_is_kept_and_a_run_that_took_its_place_is
 
 
 def main_ends(*arguments):
-    with pytest.raises(SystemExit) as ended:
-        main([str(a) for a in arguments])
-    assert not ended.value.code
+    ended(*arguments)
 
 
 def test_all_that_a_run_reads_counts_as_content(sessions):
