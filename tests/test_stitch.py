@@ -95,10 +95,10 @@ def test_every_public_name_says_what_it_returns_or_is(name):
 
 
 def test_the_package_alone_is_imported_at_once():
-    """The best of three: another process may be at work."""
-    code = "import time; began = time.perf_counter(); import stitch; print(time.perf_counter() - began)"
-    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True) for _ in range(3)]
-    assert min(float(run.stdout) for run in runs) <= 0.15
+    """In seconds of the processor: other processes may be at work."""
+    code = "import time; began = time.process_time(); import stitch; print(time.process_time() - began)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    assert float(run.stdout) <= 0.15
 
 
 def test_the_example_of_the_package_runs(tmp_path, capsys):

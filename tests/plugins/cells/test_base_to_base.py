@@ -184,9 +184,8 @@ def test_published_errors_are_ordinary_draws(errors):
         assert low < published < high
 
 
-def test_command(capsys):
-    main_(["base", str(EXAMPLE), "--json"])
-    document = json.loads(capsys.readouterr().out)
+def test_command():
+    document = json.loads(ended("base", EXAMPLE, "--json").out)
     assert np.allclose(np.array(document["T_base1_base2"])[:3, 3], [4, -1, 1], atol=1e-3)
 
 
@@ -357,10 +356,6 @@ def test_a_wrong_height_shows_in_the_chi_square():
     wrong = replace(s, rod=replace(s.rod, points=s.rod.points + np.array([[0, 0, 0], [0, 0, 0.01]])))
     with pytest.raises(NoResultError, match="chi-square"):
         solve_stand(wrong)
-
-
-def main_(arguments):
-    ended(*arguments)
 
 
 JOINTS_EXAMPLE = EXAMPLE.with_name("base_to_base_joints.toml")

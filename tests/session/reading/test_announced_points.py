@@ -73,11 +73,11 @@ def exr(width, height):
 )
 def test_a_header_that_announces_too_much_is_refused_at_once(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InputError) as refused:
         read_cloud(tmp_path / name)
     assert str(refused.value).startswith(str(tmp_path / name)) and "\n" not in str(refused.value)
-    assert "not installed" not in str(refused.value) and time.perf_counter() - began < 2.0
+    assert "not installed" not in str(refused.value) and time.process_time() - began < 2.0
 
 
 def test_an_array_that_announces_too_much_is_refused_at_once(tmp_path):
@@ -122,10 +122,10 @@ def test_arrays_that_are_packed_a_thousand_times_are_refused_before_they_are_unp
                 archive.writestr(f"{k}.npy", bytes(80_000_000))
     else:
         savemat(file, {"T": np.zeros((4, 4, 2_000_000))}, do_compression=True)
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InputError, match="bytes of arrays announced"):
         require_array_room(file)
-    assert time.perf_counter() - began < 1.0
+    assert time.process_time() - began < 1.0
     savemat(tmp_path / "small.mat", {"T": small}, do_compression=True)
     np.savez_compressed(tmp_path / "small.npz", T=small)
     require_array_room(tmp_path / "small.mat")

@@ -43,21 +43,17 @@ def test_started_again_it_runs_what_is_new_changed_or_missing(sessions, ran, cap
 
 def test_a_model_that_was_changed_since_is_kept_and_a_run_that_took_its_place_is_not_trusted(sessions, ran, batch):
     batch(sessions[0])
-    main_ends("note", "runs/monday", "looks well")
-    main_ends("add", "runs/monday", "joint_offset", "--no-recording")
+    ended("note", "runs/monday", "looks well")
+    ended("add", "runs/monday", "joint_offset", "--no-recording")
     batch(sessions[0])
     assert ran == ["monday"]
     # A run of a session that is different now leaves the mark of the batch where it is.
     edit(sessions[0] / "points.csv", r"(?m)(\d)$", lambda found: str((int(found[1]) + 1) % 10))
     before = (sessions[0] / "points.csv").read_bytes()
-    main_ends("run", sessions[0], "-o", "runs/monday", "--no-recording")
+    ended("run", sessions[0], "-o", "runs/monday", "--no-recording")
     assert (sessions[0] / "points.csv").read_bytes() == before
     batch(sessions[0])
     assert ran == ["monday", "monday"]
-
-
-def main_ends(*arguments):
-    ended(*arguments)
 
 
 def test_all_that_a_run_reads_counts_as_content(sessions):
@@ -271,7 +267,7 @@ def test_a_session_beyond_its_seconds_or_memory_is_ended_and_the_others_run(sess
     assert json.loads(capsys.readouterr().out)["done"] == 2
     kept = {"model.toml", "result.json", "ledger.json", "batch-mark.json"}
     assert {path.name for path in Path("runs/monday").iterdir()} == kept
-    main_ends("export", "runs/monday", "--to", "ros")
+    ended("export", "runs/monday", "--to", "ros")
     capsys.readouterr()
     batch(*sessions, "--json")
     assert json.loads(capsys.readouterr().out)["skipped"] == 2
