@@ -1,9 +1,4 @@
-"""A cell over days: false alarms, what is named and when, coverage, time and size; then a real arm over hours.
-
-The
-real arm is the UR10's series A: 11,911 poses with a tracker, their times and the temperature of the air. Every block is
-a session of its own, run with joint offsets and link geometry as effects, and appended to the history of a cell.
-"""
+"""A cell over days: false alarms, what is named and when, coverage, time and size."""
 
 import tempfile
 import time
@@ -12,23 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown
+from bench.harness import Parts, Row, Table, grouped, markdown
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
-from stitch.api.pipeline import run
-from stitch.model.model_toml import ModelFile
-from stitch.numerics.units import length_text
-from stitch.output.result_document import model_of
-from stitch.output.run_folder import write_with_page
 from stitch.plugins.watch import control_charts, state_bank
-from stitch.plugins.watch.history import HISTORY_FILE, open_history, read_record
+from stitch.plugins.watch.history import HISTORY_FILE, open_history
 from stitch.plugins.watch.report import CellReport, cell_report, cell_trend
 from stitch.plugins.watch.update import DAY_SECONDS, RUN_LENGTH, append_runs, regressor_prior_sigmas, regressors
-from stitch.session.reading.session_folder import load_session
-from stitch.session.session import SessionData
 from viz.watch.cell_page import write_page
 
 THERMAL = (1.0, 4.0)  # cycles, in sigmas
@@ -36,9 +23,6 @@ HALLS, CELLS_OF_HALL = 50, 50
 MONTHS = 8
 GROWTH_FROM = (0.0, 8.0)  # days
 SIZES = (100, 1_000, 10_000)
-BLOCKS, POSES, EFFECTS = 24, 120, ["joint_offset", "link_geometry"]
-HOURS = ((0, 2), (2, 4), (8, 10), (10, 12), (14, 18), (48, 58), (66, 80))
-HOUR = 3600.0
 _WORN = "joint_compliance.c2"
 _PARAMETERS = 12
 _CHANNELS = ["air_temperature_c"]
@@ -47,13 +31,12 @@ _MORE = 40
 
 
 def jobs(seeds: range, cells: int) -> Iterator[Row]:
-    """A hall of so many cells for every seed, months, sizes, and the real arm."""
+    """A hall of so many cells for every seed, months, sizes."""
     for k, thermal in enumerate(THERMAL):
         yield from ({"part": "silence", "thermal": thermal, "hall": 1000 * k + h, "cells": cells} for h in seeds)
     for start in GROWTH_FROM:
         yield from ({"part": "months", "start": start, "seed": seed} for seed in range(min(MONTHS, len(seeds))))
     yield from ({"part": "size", "sessions": sessions} for sessions in SIZES)
-    yield {"part": "real"}
 
 
 def _silence(job: Row) -> Row:
@@ -158,80 +141,6 @@ def _size(job: Row) -> Row:
     return {"costs": costs, "reported": reported, "page": page, "size": size}
 
 
-def _real(job: Row) -> Row:
-    """What the history of the measured blocks says, and a model of the first two hours judged later."""
-    session = load_session(SHARED_DATA / "ur10-tmac-A")
-    times = np.array([float(view.time_s or 0.0) for view in session.views])
-    # In blocks of equal number; of each as many views, evenly spread, as a session has.
-    blocks = np.array_split(np.arange(len(session.views)), BLOCKS)
-    blocks = [part[np.linspace(0, len(part) - 1, POSES).astype(int)] for part in blocks]
-    with tempfile.TemporaryDirectory() as folder:
-        records = []
-        for k, index in enumerate(blocks):
-            name, out = f"b{k:02d}", Path(folder) / f"b{k:02d}"
-            out.mkdir()
-            write_with_page(run(_block(session, index, name), effects=EFFECTS), out)
-            air = float(np.mean([session.views[i].covariates["air_temperature_c"] for i in index]))
-            record = read_record(out, at=1.6e9 + float(times[index].mean()))
-            covariates = {"air_temperature_c": air}
-            records.append(replace(record, session=name, session_hash=f"block {k}", covariates=covariates))
-        with open_history(Path(folder) / "ur10", new=True) as history:
-            append_runs(history, records)
-            report = cell_report(history)
-    return {"hours": times[-1] / HOUR, "moved": _moved(report), "later": _later(session, times)}
-
-
-def _block(session: SessionData, index: np.ndarray, name: str) -> SessionData:
-    """Some views as a session of their own."""
-    return replace(session, name=name, views=tuple(session.views[i] for i in index))
-
-
-def _moved(report: CellReport) -> list[list[str]]:
-    lines = []
-    for p in sorted(report.parameters, key=lambda p: -p.scatter):
-        moved = p.changes[0] if p.changes else None
-        kind = "–" if moved is None else f"{moved.kind} since {report.run_names[moved.since]}"
-        size = "–" if moved is None else f"{moved.size:.2g} ± {moved.sigma:.1g} {p.unit}"
-        air = ", ".join(f"{f.per_unit:.2g} ± {f.sigma:.1g} {p.unit}/°C" for f in p.follows) or "–"
-        lines.append([p.name, f"{p.scatter:.1f}", kind, size, air])
-    return lines
-
-
-def _later(session: SessionData, times: np.ndarray) -> list[list[str]]:
-    """The model of the first two hours on later poses, beside a model of their own hours."""
-
-    def model(index: np.ndarray) -> ModelFile:
-        return model_of(run(_block(session, index, "fitted"), effects=EFFECTS))
-
-    early = model(_some(np.flatnonzero(times < 2 * HOUR)))
-    everywhere = model(_some(np.arange(len(times))))
-    lines = []
-    for low, high in HOURS:
-        hours = np.flatnonzero((times >= low * HOUR) & (times < high * HOUR))
-        judged = _block(session, _some(hours[1::2]), "judged")
-        rms = []
-        for fitted in (early, model(_some(hours[::2])), everywhere):
-            targets = run(judged, fitted).targets
-            assert targets is not None
-            distances = targets.rows.distances(targets.rows.residual)
-            rms.append(float(np.sqrt(np.mean(distances[np.isfinite(distances)] ** 2))))
-        off = f"{joints_off(session, times, low, high):.0f}°"
-        lines.append([f"{low} to {high}", *(length_text(x, "mm") for x in rms), off])
-    return lines
-
-
-def joints_off(session: SessionData, times: np.ndarray, low: float, high: float) -> float:
-    """Median distance in the space of the joints, degrees, to the nearest other pose of the first two hours."""
-    joints = np.degrees(np.array([view.joints for view in session.views]))
-    early, later = (joints[(times >= a * HOUR) & (times < b * HOUR)] for a, b in ((0, 2), (low, high)))
-    nearest = 2 if low == 0 else 1
-    return float(np.median(cKDTree(early).query(later, k=[nearest])[0]))
-
-
-def _some(index: np.ndarray) -> np.ndarray:
-    return index[np.unique(np.linspace(0, len(index) - 1, 2 * POSES).astype(int))]
-
-
 def _silence_table(rows: list[Row]) -> list[str]:
     lines = []
     for thermal, halls in grouped(rows, "thermal").items():
@@ -277,28 +186,11 @@ def _size_table(rows: list[Row]) -> list[str]:
     return [title, "", *markdown(head, lines)]
 
 
-def _real_tables(rows: list[Row]) -> list[str]:
-    [row] = rows
-    return [
-        f"**UR10, series A**: {BLOCKS} blocks of {POSES} poses over {row['hours']:.0f} hours",
-        "",
-        *markdown("parameter | scatter of the blocks, stated sigmas | moved | size | follows the air", row["moved"]),
-        "",
-        "**The first two hours, later**: rms 3D distance of poses that took no part in a fit",
-        "",
-        *markdown(
-            "hours | model of hours 0 to 2 | model of these hours | model of all hours | joints off hours 0 to 2",
-            row["later"],
-        ),
-    ]
-
-
 PARTS = Parts(
     {
         "silence": (_silence, _silence_table),
         "months": (_month, _months_table),
         "size": (_size, _size_table),
-        "real": (_real, _real_tables),
     }
 )
 TABLE = Table(
