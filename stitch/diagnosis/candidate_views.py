@@ -22,10 +22,10 @@ _LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they 
 _MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
 
-def nearby(driven: Array, chosen: Array | None = None) -> Array:
+def nearby(driven: Array, chosen: Array | None = None, seed: int = 0) -> Array:
     """Return (K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits
     that were kept."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     about, spread = (driven, _SPREAD) if chosen is None else (chosen, _CLOSER)
     joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, driven.shape[1]))
     limit = np.maximum(_LIMIT, np.abs(driven).max(axis=0))
@@ -38,6 +38,7 @@ def reachable(
     seen_from: Array,
     centre: Array,
     chosen: Array | None = None,
+    seed: int = 0,
 ) -> Array:
     """Return (K, n) joint angles in which the scanner sees the part about as it has before.
 
@@ -47,8 +48,9 @@ def reachable(
         seen_from: the same (V, 4, 4) of the views that there are.
         centre: (3,) of what they see, reference frame.
         chosen: (C, n) joint angles to stay close to.
+        seed: of the draws.
     """
-    joints = nearby(driven, chosen)
+    joints = nearby(driven, chosen, seed)
     poses = poses_of(joints)
     there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
     before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]

@@ -5,7 +5,9 @@ covariance (of what it does not know of itself, of the arm's errors, of scatter 
 its views leave likely, of a time constant, a joint, a view from which it acts. A view is worth as much as
 these predictions differ for what they are known to (Box & Hill 1967, Technometrics 9:57; Atkinson & Fedorov 1975,
 Biometrika 62:57). Every rival in turn is taken for the true one and its views are drawn; that one is decided for which
-is then twenty times likelier than all others, as a diagnosis asks.
+is then twenty times likelier than all others, as a diagnosis asks. Among the rivals is a joint that follows the pose by
+no law that anybody wrote down. What a verdict asks beside, of views left out and of halves of the views, is in
+none of these odds.
 
 A further view is counted in the frame of the views that there are: less the mean motion of these, as nobody sees it.
 """
@@ -25,6 +27,7 @@ from stitch.diagnosis.candidate_views import (
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.unmodelled_joint_effects import JointEffect, joint_effects, log_posterior_of_any
 from stitch.model.forward import moves_points, pose_derivatives
 from stitch.model.model import Model, Term
 from stitch.numerics import frames
@@ -33,7 +36,16 @@ from stitch.numerics.kernels import exponential_kernel, process_covariance
 from stitch.numerics.least_squares import equilibrated
 from stitch.numerics.reml import NOISE, at_variances
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, flange_twists, prior_pose_errors, usual_time_step
+from stitch.observations.pose_errors import (
+    ALL_ANGLES,
+    DRIFT_MEMORY,
+    OWN_ANGLE,
+    TWO_ANGLES,
+    PoseErrors,
+    flange_twists,
+    prior_pose_errors,
+    usual_time_step,
+)
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
 from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.observations.targets.rows import TargetRows
@@ -43,6 +55,11 @@ from stitch.session.robot import forward
 
 # Poses that are tried, and again close to the best of them.
 _TRIED, _CLOSER, _BEST = 72, 24, 3
+# Times that poses are sought, until there are enough to try.
+_SEARCHES = 6
+# How much a pose sees is asked of so many points of the scans; less than this share of what the views see is too
+# little, and of a surface that is turned farther away (cosine) nothing is seen. The field reaches a tenth farther.
+_POINTS, _LEAST_SEEN, _FACING, _MARGIN = 300, 0.5, 0.2, 0.1
 # Views that are proposed at the most, and the odds at which one more is not needed.
 MOST_VIEWS, SURE = 3, 0.95
 # A view that adds less than this to the probability that the true one is named is not worth driving to.
@@ -51,6 +68,8 @@ _WORTH = 0.02
 _SEARCH_DRAWS, _STATED_DRAWS = 96, 2000
 # Forms of a rival that compete, of those within so many nats of its best.
 _FORMS, _NEAR_FORMS = 5, 6.0
+# What a joint without a law may follow, of which a pose alone tells what is expected there.
+_BY_POSE = (ALL_ANGLES, OWN_ANGLE, TWO_ANGLES)
 # Shares of the session's duration that one may wait where a rival goes with time.
 _WAITS = (0.0, 0.5, 1.0, 2.0)
 
@@ -104,18 +123,21 @@ def deciding_views(
     scores = [ranked.score for ranked in rivals]
     if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
         return None
-    if len(scores) < 2 or not all(scored.fitted for scored in scores):
+    if not all(scored.fitted for scored in scores):
         return None
     if isinstance(linear.observation, SurfaceObservation) and moves_points([scored.form.term for scored in scores]):
         return None
-    log_weights = np.array([ranked.log_posterior for ranked in rivals])
+    unnamed = unnamed_joints(linear, scores)
+    if len(scores) + bool(unnamed) < 2:
+        return None
+    log_weights = np.array([ranked.log_evidence for ranked in rivals])
     group = log_weights[:undecided]
     if undecided and np.ptp(group) > ODDS:
         log_weights[:undecided] = group.max()
     joints = possible_joints(linear)[:_TRIED]
     if not len(joints):
         return None
-    forms = competing_forms(scores, log_weights)
+    forms = competing_forms(scores, log_weights).beside(unnamed, [ranked.log_belief for ranked in rivals])
     first = _choose(linear, forms, joints, most)
     best = joints[np.argsort(-first.single, kind="stable")[:_BEST]]
     closer = possible_joints(linear, best)[:_CLOSER]
@@ -128,18 +150,54 @@ def deciding_views(
     )
 
 
+def unnamed_joints(linear: LinearModel, scores: Sequence[Score]) -> list[tuple[JointEffect, float]]:
+    """Return what single joints may do that follow the pose by no known law, beside none of the rivals, the likeliest
+    with their log posteriors; [] where the views tell of none."""
+    base = linear.restricted(linear.causes - {scored.name for scored in scores})
+    effects = joint_effects(base)
+    followed = [effect for effect in effects if effect.follows in _BY_POSE][:_FORMS]
+    factors = np.array([effect.log_bayes_factor for effect in followed])
+    shares = log_posterior_of_any(factors[None]) - np.log(max(len(effects), 1))
+    return [each for each in zip(followed, shares.tolist(), strict=True) if each[1] > shares.max() - _NEAR_FORMS]
+
+
 @dataclass(frozen=True)
 class RivalForms:
-    """Forms of all rivals, each as a score of its own."""
+    """Forms of all rivals, each as a score of its own; the last rival may be a joint without a law."""
 
-    scores: list[Score]
+    scores: list[Score | JointEffect]
     log_weights: Array  # (F,) not normalised
     rival: Indices  # (F,) whose form it is
+    log_belief: Array  # (R,) how often each rival is met, a judgement that decides nothing by itself
+    named: int  # so many rivals, the first, have a name
+
+    def beside(self, unnamed: Sequence[tuple[JointEffect, float]], log_belief: Sequence[float]) -> "RivalForms":
+        """Return them with what is believed of each, and what joints may do without a name as one rival more."""
+        weights = [*self.log_weights, *(weight for _, weight in unnamed)]
+        rival = np.append(self.rival, np.full(len(unnamed), self.named, np.int64))
+        belief = np.append(log_belief, np.zeros(int(bool(unnamed))))
+        return RivalForms(
+            [*self.scores, *(effect for effect, _ in unnamed)], np.array(weights), rival, belief, self.named
+        )
+
+    def margins(self, fits: Array) -> Array:
+        """Return (R, …) by how much each rival is ahead of all others, from log posteriors (R, …) of all.
+
+        Ahead by what the views say, and by that and what is believed.
+        """
+        others = [np.delete(np.arange(len(fits)), r) for r in range(len(fits))]
+        held = [np.minimum(self.log_belief[r] - self.log_belief[some], 0.0) for r, some in enumerate(others)]
+        return np.array(
+            [
+                (fits[r] - fits[some] + held[r].reshape(-1, *[1] * (fits.ndim - 1))).min(axis=0)
+                for r, some in enumerate(others)
+            ]
+        )
 
 
 def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
     """Return the likeliest forms of each rival, which share its weight (R,)."""
-    forms = list[Score]()
+    forms = list[Score | JointEffect]()
     weights = list[float]()
     rival = list[int]()
     for r, scored in enumerate(scores):
@@ -152,7 +210,7 @@ def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
         forms += [replace(scored, form=every[i]) for i in kept]
         weights += of_rival.tolist()
         rival += [r] * len(kept)
-    return RivalForms(forms, np.array(weights), np.array(rival))
+    return RivalForms(forms, np.array(weights), np.array(rival), np.zeros(len(scores)), len(scores))
 
 
 @dataclass(frozen=True)
@@ -222,11 +280,9 @@ def _decisions(
             ]
         )
         fits = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
-        ahead = fits[true] - np.delete(fits, true, axis=0).max(axis=0)
-        right += weight * (ahead > ODDS).mean(axis=1)
-        # The best of the others, ahead of all that are left.
-        order = np.sort(fits, axis=0)
-        wrong += weight * ((ahead < 0) & (order[-1] - order[-2] > ODDS)).mean(axis=1)
+        decided = forms.margins(fits) > ODDS
+        right += weight * decided[true].mean(axis=1)
+        wrong += weight * np.delete(decided, true, axis=0)[: forms.named].any(axis=0).mean(axis=1)
         share += weight * np.exp(fits[true] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
     return right, wrong, share
 
@@ -244,13 +300,42 @@ def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
         T = forward(linear.measurement.robot, joints)
         return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
 
-    return reachable(driven, poses_of, observation.capture.poses(T_mount), observation.centre, chosen)
+    seen_from = observation.capture.poses(T_mount)
+    least = _LEAST_SEEN * np.median(seen_shares(observation, seen_from, seen_from))
+    found = np.zeros((0, driven.shape[1]))
+    for seed in range(_SEARCHES):
+        joints = reachable(driven, poses_of, seen_from, observation.centre, chosen, seed)
+        joints = joints[seen_shares(observation, seen_from, poses_of(joints)) > least] if len(joints) else joints
+        found = np.concatenate([found, joints])
+        if len(found) >= _TRIED:
+            break
+    return found
 
 
-def _waits(linear: LinearModel, scores: Sequence[Score], count: int) -> Array:
+def seen_shares(observation: SurfaceObservation, seen_from: Array, poses: Array) -> Array:
+    """Return (K,) share of the scanned surface that faces the scanner, within its field, at poses (K, 4, 4).
+
+    Args:
+        seen_from: T_reference_scanner (V, 4, 4) of the scans.
+    """
+    scans = observation.capture.scans
+    of_each = [np.linspace(0, len(scan.points) - 1, max(_POINTS // len(scans), 1)).astype(int) for scan in scans]
+    some = list(zip(seen_from, scans, of_each, strict=True))
+    points = np.concatenate([frames.transform(T, scan.points[i]) for T, scan, i in some])
+    normals = np.concatenate([scan.normals[i] @ T[:3, :3].T for T, scan, i in some])
+    boxes = np.array([scan.box for scan in scans])
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+    there = frames.transform(frames.inverse(poses), points)
+    sight = some[0][1].eye - there
+    facing = np.einsum("kmi,kmi->km", normals @ poses[:, :3, :3], sight) > _FACING * np.linalg.norm(sight, axis=2)
+    return np.asarray((facing & (there > low).all(axis=2) & (there < high).all(axis=2)).mean(axis=1))
+
+
+def _waits(linear: LinearModel, scores: Sequence[Score | JointEffect], count: int) -> Array:
     """Return (N,) s that one waits before each view; none where no rival goes with time."""
     views = linear.measurement.views
-    effects = [scored.candidate.effect for scored in scores]
+    effects = [scored.candidate.effect for scored in scores if isinstance(scored, Score)]
     with_time = any("time" in effect.needs or "time" in effect.prefers for effect in effects)
     if not with_time or not views.has("time"):
         return np.zeros(count)
@@ -258,14 +343,17 @@ def _waits(linear: LinearModel, scores: Sequence[Score], count: int) -> Array:
     return np.asarray((shares * float(np.ptp(views.time))).round(-1))
 
 
-def predict_views(linear: LinearModel, scores: Sequence[Score], joints: Array, wait: Array) -> list[Prediction]:
+def predict_views(
+    linear: LinearModel, scores: Sequence[Score | JointEffect], joints: Array, wait: Array
+) -> list[Prediction]:
     """Return what each rival expects of views at joints (N, n)."""
     match linear.observation:
         case SurfaceObservation() as surfaces:
             further = _FurtherScans.of(linear, surfaces, joints, wait)
             return [_predict_scans(linear, scored, further) for scored in scores]
         case TargetRows() as targets:
-            return [_predict_targets(linear, targets, scored, joints, wait) for scored in scores]
+            named = [scored for scored in scores if isinstance(scored, Score)]
+            return [_predict_targets(linear, targets, scored, joints, wait) for scored in named]
     return []
 
 
@@ -300,8 +388,8 @@ class _FurtherScans:
         mean = columns[: self.before].reshape(-1, 6, columns.shape[1]).mean(axis=0)
         return columns[self.before :] - np.tile(mean, ((len(columns) - self.before) // 6, 1))
 
-    def covariance(self, base: LinearModel) -> Array:
-        """(6 (V + N), 6 (V + N)) of the twists by what poses err."""
+    def covariance(self, base: LinearModel, unnamed: JointEffect | None) -> Array:
+        """(6 (V + N), 6 (V + N)) of the twists by what poses err, and a joint without a law."""
         variances = base.null.variances
         n = 6 * len(self.flange)
         blocks = np.zeros((len(self.flange), 6, len(self.flange), 6))
@@ -310,9 +398,19 @@ class _FurtherScans:
         blocks[each, :, each] = (self.flange * white) @ self.flange.transpose(0, 2, 1)
         out = blocks.reshape(n, n)
         if self.errors is not None and base.pose_errors is not None:
-            errors = self.errors.restricted(base.pose_errors.causes)
-            out = out + np.einsum("c,cij->ij", variances[NOISE + 1 :], errors.components)
+            components = self.errors.restricted(base.pose_errors.causes).components
+            if unnamed is not None:
+                components = np.concatenate([components, self._of_joint(unnamed)[None]])
+            out = out + np.einsum("c,cij->ij", variances[NOISE + 1 :], components)
         return out
+
+    def _of_joint(self, unnamed: JointEffect) -> Array:
+        """(6 (V + N), 6 (V + N)) of the twists by a joint without a law, of unit variance."""
+        assert self.errors is not None
+        here, every = unnamed.errors, self.errors.joint_processes[unnamed.follows]
+        own = here.joints[unnamed.process], here.others[unnamed.process] if here.others else None
+        same = list(zip(every.joints, every.others or (None,) * len(every.joints), strict=True)).index(own)
+        return every.twist_covariance(same)
 
     def noise(self, base: LinearModel) -> Array:
         """(6, 6) by which the surfaces put a view where it is not: as of the views that there are."""
@@ -336,14 +434,16 @@ def _with_drift(errors: PoseErrors, every: Measurement, before: Measurement, cen
     return replace(errors, components=components)
 
 
-def _predict_scans(linear: LinearModel, scored: Score, scans: _FurtherScans) -> Prediction:
-    base = model_beside(linear, scored)
+def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _FurtherScans) -> Prediction:
+    unnamed = scored if isinstance(scored, JointEffect) else None
+    base = scored.model if isinstance(scored, JointEffect) else model_beside(linear, scored)
     measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre
     hand_eye = hand_eye_jacobian(measurement.capture.hand_eye_frames(bare.T_mount), centre)
-    used = _used_columns(linear, scans)
-    effect = _twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep]
-    columns = scans.further(np.hstack([hand_eye, used, effect]))
-    covariance = scans.covariance(base)
+    every = [hand_eye, _used_columns(linear, scans)]
+    if isinstance(scored, Score):
+        every.append(_twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep])
+    columns = scans.further(np.hstack(every))
+    covariance = scans.covariance(base, unnamed)
     across = scans.further(covariance[:, : scans.before] @ scans.surfaces.reduced_poses.reduction.T)
     together = scans.further(scans.further(covariance).T)
     N = len(columns) // 6
@@ -375,7 +475,9 @@ def _twists(measurement: Measurement, model: Model, term: Term, centre: Array) -
     return derivative.reshape(len(derivative), -1).T
 
 
-def _given_views(base: LinearModel, scored: Score, columns: Array, across: Array) -> tuple[Array, Array, Array]:
+def _given_views(
+    base: LinearModel, scored: Score | JointEffect, columns: Array, across: Array
+) -> tuple[Array, Array, Array]:
     """Return mean (M,) of further numbers given those that were seen, the root (M, q) of what is not known of the
     coefficients, and the covariance (M, M) that the seen ones explain.
 
@@ -383,10 +485,12 @@ def _given_views(base: LinearModel, scored: Score, columns: Array, across: Array
         columns: (M, q) of the further numbers: hand-eye and effects in use, then the rival's parameters.
         across: (M, n) covariance with the reduced observations.
     """
-    white = np.column_stack([base.white_design, base.whiten(scored.form.columns)])
+    white, precision = base.white_design, np.zeros(base.white_design.shape[1])
+    if isinstance(scored, Score):
+        # A rival is of plausible size, or as much larger as it seems to be.
+        white = np.column_stack([white, base.whiten(scored.form.columns)])
+        precision = np.append(precision, (scored.scale * scored.form.sizes) ** -2.0)
     seen = base.whiten(np.ascontiguousarray(across.T))
-    # A rival is of plausible size, or as much larger as it seems to be.
-    precision = np.append(np.zeros(base.white_design.shape[1]), (scored.scale * scored.form.sizes) ** -2.0)
     normal, unit = equilibrated(white.T @ white + np.diag(precision))
     values, vectors = np.linalg.eigh(normal)
     root = unit[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))

@@ -11,6 +11,7 @@ other's part: then the smallest set is sought without which the views cannot do 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views
+from stitch.system.threads import parallel
 
 # The effect of the direction from which a joint comes.
 _BY_DIRECTION = "backlash"
@@ -163,12 +165,14 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     contenders = [r for r in evidence.ranked if is_contender(r)]
     if not contenders:
         return Reply("none that could be named", ends=True)
-    base = case.linear.restricted(case.linear.causes - {r.name for r in contenders})
+    base = _without(case.linear, contenders)
+    hidden = _hidden_contenders(case, base, evidence.ranked)
+    first, contenders = contenders[0], [*contenders, *hidden]
     if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
-        contenders = sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior)
-    hidden = _hidden_contenders(case, base, evidence.ranked)
-    contenders = [*contenders, *hidden.values()]
+        base = _without(case.linear, contenders)
+        contenders = [rescored_in(base, r) for r in contenders]
+    ranked = _with_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
     contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
@@ -184,29 +188,51 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         "contenders": tuple(contenders),
         "base": base,
         "unmodelled_log_posterior": unmodelled,
-        "ranked": rescored_against(_with_hidden(evidence.ranked, hidden), best, unmodelled),
+        "ranked": rescored_against(ranked, best, unmodelled),
     }
     return Reply(best.name, changes)
 
 
-def _hidden_contenders(case: Case, base: LinearModel, ranked: Sequence[Ranked]) -> dict[str, Ranked]:
-    """Return effects, by name, that could be named only where no contender is among the errors that remain: a base that
-    gives way explains nothing beside joints that may give way by as much as the views show."""
+def _without(linear: LinearModel, effects: Sequence[Ranked]) -> LinearModel:
+    """Return the model in which none of the effects is among the errors that remain."""
+    return linear.restricted(linear.causes - {r.name for r in effects})
+
+
+def _hidden_contenders(case: Case, base: LinearModel, ranked: Sequence[Ranked]) -> list[Ranked]:
+    """Return effects that could be named only where no contender is among the errors that remain: a base that gives
+    way, or an uneven gear, explains nothing beside joints that may give way by as much as the views show."""
     if base is case.linear:
-        return {}
-    weak = {r.name for r in ranked if not is_contender(r)} - base.causes
-    likely = promising(base, [c for c in case.candidates if c.name in weak], limits.CANDIDATES_TRIED)
-    again = rank([score(base, candidate) for candidate, _ in likely], len(ranked))[0]
-    return {r.name: r for r in again if is_contender(r)}
+        return []
+    weak = [c for c in case.candidates if any(c.name == r.name and not is_contender(r) for r in ranked)]
+    remaining = [c for c in weak if c.name in base.causes]
+    likely = promising(base, [c for c in weak if c not in remaining], limits.CANDIDATES_TRIED)
+    tried = [*remaining, *(candidate for candidate, _ in likely)]
+    again = rank(list(parallel(partial(score, base), tried)), len(ranked))[0]
+    return [r for r in again if is_contender(r)]
 
 
-def _with_hidden(ranked: Sequence[Ranked], hidden: Mapping[str, Ranked]) -> tuple[Ranked, ...]:
-    """Return the ranking with these as they are scored now; posterior shares make room for them."""
-    first = ranked[0]
-    for r in hidden.values():
-        ranked = rescored_against(ranked, first, r.log_posterior)
-    share = ranked[0].posterior
-    beside = {n: replace(r, posterior=share * np.exp(r.log_posterior - first.log_posterior)) for n, r in hidden.items()}
+def _with_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
+    """Return the ranking with those contenders that were none in it; posterior shares make room for them.
+
+    Args:
+        first: the contender that was the likeliest.
+        contenders: as they are scored now.
+    """
+    now = {r.name: r for r in contenders}
+    hidden = [now[r.name] for r in ranked if r.name in now and not is_contender(r)]
+    behind = {r.name: r.log_posterior - now[first.name].log_posterior for r in hidden}
+    for name in behind:
+        ranked = rescored_against(ranked, first, first.log_posterior + behind[name])
+    share = next(r.posterior for r in ranked if r.name == first.name)
+    beside = dict[str, Ranked]()
+    for r in hidden:
+        less = r.score.log_bayes_factor - now[first.name].score.log_bayes_factor
+        beside[r.name] = replace(
+            r,
+            score=replace(r.score, log_bayes_factor=first.score.log_bayes_factor + less),
+            log_posterior=first.log_posterior + behind[r.name],
+            posterior=share * float(np.exp(behind[r.name])),
+        )
     return tuple(sorted((beside.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
 
 
@@ -258,7 +284,10 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
         prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
         of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
         if not _beaten_by_unmodelled(of_both, evidence):
-            return Reply(f"not beside {second.name}", {"further": second, "together": (best, second)})
+            # The likelier one beside the other goes first, which alone may have been the weaker.
+            beside = rank_one(conditioned_on_effects(case.linear, [second]), best.score.candidate, second.tests)
+            pair = (best, second) if beside.log_posterior >= second.log_posterior else (second, beside)
+            return Reply(f"not beside {second.name}", _naming(pair))
     return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
 
 
@@ -285,8 +314,8 @@ def which_come_near(case: Case, evidence: Evidence) -> Reply | None:
     if evidence.further is not None:
         return None  # each was asked beside the other
     best = evidence.explanation[0]
-    likely = [r for r in evidence.contenders if r.log_posterior > best.log_posterior - limits.ODDS]
-    near = [r for r in likely if r.name != best.name and r.name not in evidence.refused]
+    others = [r for r in evidence.contenders if r.name != best.name and r.name not in evidence.refused]
+    near = [r for r in others if r.comes_near(best)]
     return Reply(_names(near) or "none", {"explanation": (best, *near)})
 
 
@@ -581,7 +610,7 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
     if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
         return ()
-    near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - limits.ODDS]
+    near = [r for r in again if is_contender(r) and r.comes_near(again[0])]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
     return tuple(near) if len(near) > 1 else again
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from stitch.diagnosis.deciding_view import DecidingViews, deciding_views, possible_joints
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
-from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.evidence import does_an_unmodelled_effect_explain_it
+from stitch.diagnosis.ranking import Ranked, is_contender
 from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, CLEAR_DEPENDENCE
 from stitch.model.forward import moves_points
@@ -79,9 +80,13 @@ def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
 
 
 def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
-    """Return the group that was named, or the best candidate and its nearest alias; else nothing."""
+    """Return the group that was named, what a joint without a law explains as well, or the best candidate and its
+    nearest alias; else nothing."""
     if len(diagnosis.named) > 1:
         return list(diagnosis.named)
+    unmodelled = does_an_unmodelled_effect_explain_it.__name__
+    if diagnosis.verdict == "unknown_effect" and any(a.name == unmodelled and a.changed for a in diagnosis.answers):
+        return [c.ranked for c in diagnosis.candidates if is_contender(c.ranked)][:_OTHERS]
     fitted = [c.ranked for c in diagnosis.candidates if c.ranked.score.observable and c.ranked.score.fitted]
     likeliest = fitted[:_LIKELIEST]
     if diagnosis.verdict in ("adequate", "unknown_effect") or len(likeliest) < 2:
@@ -94,11 +99,14 @@ def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
 
 def _others_near(diagnosis: Diagnosis, group: list[Ranked]) -> list[Ranked]:
     """Return the likeliest other effects of poses: one that is behind now may be ahead after a further view."""
-    least = max(ranked.log_posterior for ranked in group) - _NEAR
+    rows = {c.name: c.ranked for c in diagnosis.candidates}
+    # What is named was scored where none of its rivals is among the errors.
+    higher = group[0].log_posterior - rows[group[0].name].log_posterior
+    least = max(ranked.log_posterior for ranked in group) - _NEAR - higher
     others = [
-        c.ranked
-        for c in diagnosis.candidates
-        if c.ranked.score.fitted and c.ranked.log_posterior > least and c.name not in {r.name for r in group}
+        replace(ranked, log_posterior=ranked.log_posterior + higher)
+        for name, ranked in rows.items()
+        if ranked.score.fitted and ranked.log_posterior > least and name not in {r.name for r in group}
     ]
     return [ranked for ranked in others if not moves_points([ranked.score.form.term])][:_OTHERS]
 

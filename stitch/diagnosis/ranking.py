@@ -40,6 +40,24 @@ class Ranked:
         """Log odds over nothing being missing."""
         return self.log_posterior - float(np.log(limits.PRIOR_NOTHING))
 
+    @property
+    def log_belief(self) -> float:
+        """How often it is met beside a usual effect: a judgement."""
+        return float(np.log(self.score.candidate.effect.prior))
+
+    @property
+    def log_evidence(self) -> float:
+        """Log posterior without that judgement: what the views say."""
+        return self.log_posterior - self.log_belief
+
+    def comes_near(self, best: "Ranked") -> bool:
+        """Return whether the views do not take it 20 to 1 behind the best.
+
+        How often effects are met is a judgement: it orders those that explain as much, and takes none out of them.
+        """
+        behind = min(best.log_posterior - self.log_posterior, best.log_evidence - self.log_evidence)
+        return behind < limits.ODDS
+
 
 def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """Return all candidates scored and ranked among each other; those that these views cannot show are no tests."""

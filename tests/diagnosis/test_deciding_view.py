@@ -24,6 +24,7 @@ from stitch.diagnosis.deciding_view import (
     deciding_views,
     possible_joints,
     predict_views,
+    unnamed_joints,
 )
 from stitch.diagnosis.effect_trend import EffectTrend, expected_in_view, trend_in_model, trends_of_candidates
 from stitch.diagnosis.score import score
@@ -48,7 +49,7 @@ def prediction(mean, sigma):
 
 def alike(count):
     """Rivals of one form each, equally likely."""
-    return RivalForms([], np.zeros(count), np.arange(count))
+    return RivalForms([], np.zeros(count), np.arange(count), np.zeros(count), count)
 
 
 @pytest.mark.parametrize("apart", [2.0, 3.0, 5.0])
@@ -72,10 +73,25 @@ def test_a_rival_that_may_take_the_form_of_another_leaves_that_one_unnamed():
     """With half of its weight on the same prediction no view makes the other more than twice as likely."""
     draws = np.random.default_rng(0).standard_normal((20_000, 1))
     predictions = [prediction(0.0, 0.02), prediction(0.0, 0.02), prediction(0.4, 0.02)]
-    forms = RivalForms([], np.log([0.5, 0.25, 0.25]), np.array([0, 1, 1]))
+    forms = RivalForms([], np.log([0.5, 0.25, 0.25]), np.array([0, 1, 1]), np.zeros(2), 2)
     right, wrong, share = deciding_view._decisions(predictions, forms, [], np.zeros(1, int), draws)
     assert right[0] == pytest.approx(0.25, abs=1e-3) and wrong[0] == 0.0
     assert share[0] == pytest.approx(0.5 * 2 / 3 + 0.25 / 3 + 0.25, abs=1e-3)
+
+
+def test_what_is_believed_of_a_rival_makes_it_harder_to_name_and_the_other_no_easier():
+    draws = np.random.default_rng(0).standard_normal((40_000, 1))
+    rivals = [prediction(0.0, 0.02), prediction(0.06, 0.02)]
+    belief = np.log([1.0, 0.04])
+    for true, harder in ((0, 0.0), (1, np.log(25.0))):
+        weights = np.where(np.arange(2) == true, 0.0, -50.0)
+        forms = RivalForms([], weights, np.arange(2), belief, 2)
+        right, *_ = deciding_view._decisions(rivals, forms, [], np.zeros(1, int), draws)
+        # The weights take the other for out of the question by 50 nats: what is left to decide is that less.
+        fair = replace(forms, log_belief=belief * 0)
+        assert right[0] == deciding_view._decisions(rivals, fair, [], np.zeros(1, int), draws)[0][0]
+        ahead = np.array([[3.5], [0.0]]) if true == 0 else np.array([[0.0], [3.5]])
+        assert forms.margins(ahead)[true, 0] == pytest.approx(3.5 - harder)
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +106,10 @@ def cell():
 
 
 def rivals_of(found):
-    """As if the first views told them not apart at all."""
+    """As if the first views told them not apart at all, both as likely as the better one."""
     named = [c.ranked for c in found.candidates if c.name in ("gear_eccentricity", "gear_harmonic")]
-    return [replace(ranked, log_posterior=0.0) for ranked in named]
+    likelier = max(ranked.log_posterior for ranked in named)
+    return [replace(ranked, log_posterior=likelier) for ranked in named]
 
 
 def test_what_is_expected_of_a_further_view_is_what_it_shows_within_what_is_known(cell):
@@ -130,7 +147,9 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
     rivals = rivals_of(found)
     views = deciding_views(found.linear, rivals, most=1)
     joints = possible_joints(found.linear)[:40]
-    forms = competing_forms([r.score for r in rivals], np.array([r.log_posterior for r in rivals]))
+    scores = [r.score for r in rivals]
+    forms = competing_forms(scores, np.array([r.log_posterior for r in rivals]))
+    forms = forms.beside(unnamed_joints(found.linear, scores), [0.0, 0.0])
     tried = predict_views(found.linear, forms.scores, joints, np.zeros(len(joints)))
     draws = np.random.default_rng(5).standard_normal((2000, 6))
     right = deciding_view._decisions(tried, forms, [], np.arange(len(joints)), draws)[0]
@@ -159,8 +178,9 @@ def test_rivals_that_a_verdict_holds_undecided_are_not_decided_by_the_evidence_s
     """Evidence that did not count for the verdict must not make its view as good as certain."""
     found = cell[0]
     first, second = rivals_of(found)
-    ahead = [replace(first, log_posterior=9.0), second]
-    alike = deciding_views(found.linear, [first, second], most=1, undecided=2)
+    both = [replace(ranked, log_posterior=first.log_posterior + 9.0) for ranked in (first, second)]
+    ahead = [both[0], second]
+    alike = deciding_views(found.linear, both, most=1, undecided=2)
     held = deciding_views(found.linear, ahead, most=1, undecided=2)
     believed = deciding_views(found.linear, ahead, most=1)
     assert held.probability == pytest.approx(alike.probability)
