@@ -406,9 +406,6 @@ def values(tmp_path_factory):
 NO_VALUES = {"LiveSession"}
 
 
-NO_CLASS_OF_STITCH = {"Table"}
-
-
 def test_every_public_class_is_a_value_that_a_process_hands_back(values):
     public = {kind.__name__ for kind in HELD} | {
         name for name in stitch.__all__ if inspect.isclass(getattr(stitch, name))

@@ -72,22 +72,6 @@ def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     assert load_run(folder / "r").model.terms[0].effect.name == "joint_compliance"
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_drawing")
-def test_a_model_with_an_effect_is_used_compared_and_undone(session_on_disk, stitch_command):
-    folder = session_on_disk
-    shutil.copytree(folder / "r0", folder / "r", dirs_exist_ok=True)
-    stitch_command("add", folder / "r", "joint_compliance", "--no-recording")
-    result = json.loads((folder / "r" / "result.json").read_text())
-    stitch_command("run", folder / "s", "-o", folder / "again", "--hand-eye", folder / "r", "--no-recording")
-    again = json.loads((folder / "again" / "result.json").read_text())
-    assert again["residual_rms"] == pytest.approx(result["residual_rms"], rel=0.02)
-    stitch_command("compare", folder / "r", "--json")
-    assert "Where model and measurement differ" in (folder / "r" / "report.html").read_text()
-    stitch_command("drop", folder / "r", "joint_compliance", "--no-recording")
-    assert json.loads((folder / "r" / "result.json").read_text())["effects"] == {}
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -35,16 +35,6 @@ def made(tmp_path, cell, capsys, *command):
     return truth, json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.slow
-def test_panel_names_the_hidden_leg(tmp_path, capsys):
-    truth, found = made(tmp_path, "panel-robots", capsys, "panel", "FOLDER/job.toml", "--json")
-    hidden = truth["hidden"]
-    named = {name for name, leg in found["leg_offsets"].items() if leg["found"]}
-    leg = found["leg_offsets"][hidden["robot"]]
-    assert named == {hidden["robot"]} and leg["leg"] == hidden["leg"]
-    assert abs(leg["offset"] - hidden["offset"]) < 4 * leg["sigma"]
-
-
 def test_drilling_finds_distortion_and_plate(tmp_path, capsys):
     truth, found = made(tmp_path, "drilling", capsys, "drill", "FOLDER/job.toml", "--json")
     for effect in found["camera_effects"]:

@@ -65,16 +65,6 @@ def test_error_is_that_of_the_covariance(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["line", "area"])
-def test_exact_without_noise(kind):
-    cell = sphere_cell(3, kind, pose_noise=0.0, noise=0.0)
-    start = global_start(cell.G, views_of(cell))
-    fit = fit_sphere(cell.G, views_of(cell), start.T_mount, RADIUS)
-    assert np.abs(twist(cell, fit.T_mount) * [100, 100, 100, 1, 1, 1]).max() < 1e-3
-    assert fit.centre == pytest.approx(cell.centre, abs=1e-3)
-
-
-@pytest.mark.slow
 def test_sides_of_laser_lines_are_found_from_all_poses():
     for seed in range(6):
         cell = sphere_cell(seed, turns=0.6)
