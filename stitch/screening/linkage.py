@@ -45,21 +45,6 @@ PointVisibility = NDArray[np.int8]
 
 
 @dataclass(frozen=True)
-class Link:
-    """The overlap of two views."""
-
-    v: int
-    w: int
-    count: int  # correspondences within the robust gate
-    share: float  # of all correspondences of the pair, 0 … 1
-
-    @property
-    def holds(self) -> bool:
-        """True if the pair says something about its two poses."""
-        return self.share >= LINKED_SHARE and self.count >= HOLDING
-
-
-@dataclass(frozen=True)
 class Linkage:
     """The graph of overlaps of V views; components are sorted, largest first."""
 
@@ -86,23 +71,26 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
     """
     gram = overlaps.gram
     matched = {(m.v, m.w): len(m.residual) for m in overlaps.matches}
-    links = []
-    for i, pair in enumerate(gram.pairs):
-        v, w = (int(view) for view in pair)
-        if gram.labelled[i]:
-            # Common targets have names: they always belong together.
-            links.append(Link(v, w, HOLDING, 1.0))
-        elif v not in holding_nothing and w not in holding_nothing and matched.get((v, w)):
-            count = int(gram.count[i])
-            links.append(Link(v, w, count, count / matched[v, w]))
-    return linkage_of_links(gram.views, links)
+    pairs = [(int(v), int(w)) for v, w in gram.pairs]
+    # Common targets have names: they always belong together.
+    held = [
+        pair
+        for pair, count, labelled in zip(pairs, gram.count, gram.labelled, strict=True)
+        if labelled or (not {*pair} & {*holding_nothing} and pair_holds(int(count), matched.get(pair, 0)))
+    ]
+    return linkage_of_pairs(gram.views, held)
 
 
-def linkage_of_links(views: int, links: Sequence[Link]) -> Linkage:
-    """Return the linkage of V views from their links."""
+def pair_holds(count: int, matched: int) -> bool:
+    """Return True if so many correspondences within the robust gate, of all that matched, say something of two poses."""
+    return count >= HOLDING and count >= LINKED_SHARE * matched > 0
+
+
+def linkage_of_pairs(views: int, pairs: Sequence[tuple[int, int]]) -> Linkage:
+    """Return the linkage of V views from the pairs that hold."""
     near = np.zeros((views, views), bool)
-    for link in links:
-        near[link.v, link.w] = near[link.w, link.v] = link.holds
+    for v, w in pairs:
+        near[v, w] = near[w, v] = True
     single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
     count, label = connected_components(coo_array(near), directed=False)
     parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]

@@ -14,7 +14,6 @@ from stitch.numerics.distributions import MAD_TO_SIGMA, nan_median
 from stitch.numerics.frames import Array, Indices
 from stitch.observations.targets.outliers import LIMIT_TARGET
 from stitch.observations.targets.rows import COMPARED_TARGETS, distance_sigma, target_distances, target_positions
-from stitch.screening.hypotheses import sentence
 from stitch.session.capture import Sightings
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
@@ -35,11 +34,6 @@ class MovedTarget:
     start: int
     distance: float  # length_unit: by which its distances to the others change at the most
     drifts: bool = False
-
-    def describe(self, view: str, length: str) -> str:
-        """Return a warning with what to do; with the name of the view and that distance in words."""
-        mistake = "target creeps" if self.drifts else "target moved"
-        return sentence(mistake, target=self.target, view=view, length=length)
 
 
 def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:

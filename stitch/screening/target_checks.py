@@ -42,9 +42,9 @@ def target_problems(session: SessionData, sightings: Sightings | None) -> list[S
     mixed_up = find_mislabelled(every)
     out = [problem("names of targets", [names[m.view]], message=m.message(names[m.view])) for m in mixed_up]
     for moved in find_moved_targets(drop_mislabelled(every) or every):
-        views = () if moved.drifts else tuple(names[moved.start :])
+        mistake, views = ("target creeps", []) if moved.drifts else ("target moved", names[moved.start :])
         length = length_text(moved.distance, session.length_unit)
-        out.append(SessionProblem("displaced", views, moved.describe(names[moved.start], length)))
+        out.append(problem(mistake, views, target=moved.target, view=names[moved.start], length=length))
     return out
 
 

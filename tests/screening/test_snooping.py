@@ -13,7 +13,7 @@ from pykdtree.kdtree import KDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch.numerics import frames
-from stitch.screening.linkage import Link, find_contradicting_views, linkage_of_links
+from stitch.screening.linkage import find_contradicting_views, linkage_of_pairs, pair_holds
 from stitch.screening.motions import register_scan_pairs
 from stitch.screening.pairing import exchange_cycles, exchanged_pairs, find_common_displacement
 from stitch.screening.placement import (
@@ -114,34 +114,29 @@ def test_motions_between_scans_are_those_of_the_cell(cell):
     assert np.mean(off < 2e-3) > 0.7
 
 
-def links(*pairs, share=1.0, count=100):
-    return [Link(v, w, count, share) for v, w in pairs]
-
-
 def test_a_chain_is_one_component_and_its_ends_hang_by_one_pair():
-    found = linkage_of_links(5, links((0, 1), (1, 2), (2, 3), (3, 4)))
+    found = linkage_of_pairs(5, [(0, 1), (1, 2), (2, 3), (3, 4)])
     assert found.components == ((0, 1, 2, 3, 4),)
     assert found.single == ((0, 1), (4, 3))
 
 
 def test_in_a_ring_nothing_hangs_by_one_pair():
-    found = linkage_of_links(6, links(*((v, (v + 1) % 6) for v in range(6))))
+    found = linkage_of_pairs(6, [(v, (v + 1) % 6) for v in range(6)])
     assert (found.single, found.unlinked) == ((), ())
 
 
 def test_two_rings_are_two_groups():
-    found = linkage_of_links(7, links((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 6), (6, 3)))
+    found = linkage_of_pairs(7, [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 6), (6, 3)])
     assert found.components == ((3, 4, 5, 6), (0, 1, 2))
 
 
 def test_pairs_that_lie_near_without_closing_link_nothing():
-    found = linkage_of_links(3, [*links((0, 1)), *links((1, 2), share=0.2)])
-    assert found.unlinked == (2,)
-    assert linkage_of_links(3, [*links((0, 1)), *links((1, 2), count=5)]).unlinked == (2,)
+    assert pair_holds(100, 100)
+    assert not pair_holds(100, 500) and not pair_holds(5, 5) and not pair_holds(0, 0)
 
 
 def test_a_view_without_any_pair_is_unlinked_and_not_a_group():
-    found = linkage_of_links(3, links((0, 1)))
+    found = linkage_of_pairs(3, [(0, 1)])
     assert found.unlinked == (2,)
 
 
@@ -300,7 +295,7 @@ def test_a_group_moves_back_as_one(blade_capture):
     apart = poses.copy()
     apart[half:] = frames.exp(PLACES_SLIP) @ poses[half:]
     chains = [range(half), range(half, views)]
-    linked = linkage_of_links(views, [Link(v, v + 1, 100, 1.0) for chain in chains for v in chain[:-1]])
+    linked = linkage_of_pairs(views, [(v, v + 1) for chain in chains for v in chain[:-1]])
     placed = place_groups(capture, apart, linked, (0.1, 0.7))
     moved, kept = (placed, set(range(views)) - set(placed))
     assert set(moved) in (set(chains[0]), set(chains[1]))
