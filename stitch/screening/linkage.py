@@ -82,7 +82,7 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
 
 
 def pair_holds(count: int, matched: int) -> bool:
-    """Return True if so many correspondences within the robust gate, of all that matched, say something of two poses."""
+    """Return True if so many correspondences within the robust gate, of all that matched, tell two poses."""
     return count >= HOLDING and count >= LINKED_SHARE * matched > 0
 
 

@@ -61,9 +61,9 @@ _NEIGHBOURS, _AROUND, _PURE = 25, 60, 0.02
 _STEPS, _TORN_STEPS, _NEAR, _CONVERGED, _PATCHES = 40, 20, 0.5, 0.02, 6
 # Stock of fewer sigmas of a single distance, of its own uncertainty or of the poses is none; nor on less of a surface.
 _LEAST, _SURE, _TIMES_SCATTER, _LEAST_SHARE = 1.5, 5.0, 3.0, 0.05
-# Nats by which stock explains more than any motion does, and than none (20,000 to 1). Share of distances that are of no
-# surface.
-_MARGIN, _STRAY = 10.0, 0.02
+# Nats by which stock explains more than any motion does, and than none (20,000 to 1), and than a torn scan (150 to 1).
+# Share of distances that are of no surface.
+_MARGIN, _OVER_TORN, _STRAY = 10.0, 5.0, 0.02
 # Eleven views hardly say how poses scatter: by half of what is usual at the least.
 _LEAST_SCATTER = 0.5
 # Neighbouring distances share points, normals and the scanner's own errors: so many of a region are worth one.
@@ -216,7 +216,7 @@ def stock_of(
     if case is None:
         return None
     best = _fit(case, "stock")
-    if best is None or best.share < _LEAST_SHARE or best.over_torn < 0:
+    if best is None or best.share < _LEAST_SHARE or best.over_torn < _OVER_TORN:
         return None
     if abs(best.thickness) < max(_LEAST * case.sigma, _SURE * best.sigma, _TIMES_SCATTER * case.scatter):
         return None
