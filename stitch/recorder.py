@@ -38,26 +38,10 @@ class RecorderMemory:
     """Keeps what it is told by stages that run beside others, to tell it in their turn."""
 
     def __init__(self) -> None:
-        self._calls: list[tuple[str, tuple[Any, ...]]] = []
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.stopped = False
 
-    def start(self, session: SessionData) -> None:
-        """Keep that a run begins."""
-        self._keep("start", session)
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep one iteration."""
-        self._keep("iteration", stage, index, poses, rms, gate)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """Keep the end of a stage."""
-        self._keep("stage", result, poses)
-
-    def finish(self, run: RunData) -> None:
-        """Keep the result."""
-        self._keep("finish", run)
-
-    def _keep(self, method: str, *arguments: Any) -> None:
+    def tell(self, call: str, *arguments: Any) -> None:
         """Keep one call.
 
         Raises:
@@ -65,12 +49,28 @@ class RecorderMemory:
         """
         if self.stopped:
             raise CancelledError
-        self._calls.append((method, arguments))
+        self.calls.append((call, arguments))
+
+    def start(self, session: SessionData) -> None:
+        """Tell that a run begins."""
+        self.tell("start", session)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Tell one iteration."""
+        self.tell("iteration", stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Tell the end of a stage."""
+        self.tell("stage", result, poses)
+
+    def finish(self, run: RunData) -> None:
+        """Tell the result."""
+        self.tell("finish", run)
 
     def replay(self, recorder: Recorder) -> None:
         """Pass on all that was kept."""
-        for method, arguments in self._calls:
-            getattr(recorder, method)(*arguments)
+        for call, arguments in self.calls:
+            getattr(recorder, call)(*arguments)
 
 
 class RunMemory(RecorderMemory):
@@ -82,42 +82,28 @@ class RunMemory(RecorderMemory):
 
     def start(self, session: SessionData) -> None:
         """Begin to keep another run."""
-        self._calls = []
+        self.calls = []
         super().start(session)
 
     def finish(self, run: RunData) -> None:
         """Take what was kept as that of a run."""
-        self._finished.append((run.model, self._calls))
+        self._finished.append((run.model, self.calls))
 
-    def tell(self, recorder: Recorder, run: RunData) -> None:
+    def replay_run(self, recorder: Recorder, run: RunData) -> None:
         """Pass on all that was kept of a run, and the run as it is now."""
-        self._calls = next((calls for model, calls in self._finished if model is run.model), [])
+        self.calls = next((calls for model, calls in self._finished if model is run.model), [])
         self.replay(recorder)
         recorder.finish(run)
 
 
-class RecorderGroup:
+class RecorderGroup(RecorderMemory):
     """Several recorders at once."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
+        super().__init__()
         self.recorders = recorders
 
-    def start(self, session: SessionData) -> None:
-        """Pass on."""
+    def tell(self, call: str, *arguments: Any) -> None:
+        """Pass on one call, which nobody asks for again."""
         for recorder in self.recorders:
-            recorder.start(session)
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.iteration(stage, index, poses, rms, gate)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.stage(result, poses)
-
-    def finish(self, run: RunData) -> None:
-        """Pass on."""
-        for recorder in self.recorders:
-            recorder.finish(run)
+            getattr(recorder, call)(*arguments)

@@ -4,7 +4,8 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from operator import attrgetter
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
 from stitch.system.values import Table, Value
 
+Passed = TypeVar("Passed")
 # By which methods register moves single views, for people.
 METHOD_TITLES = {
     "dpwvm": "DPWVM-style weighted fit",
@@ -195,6 +197,16 @@ class HandEyeTransfer:
         )
 
 
+def passed_on(place: str, kind: type[Passed], doc: str) -> Passed:
+    """Return a property that hands out what stands at a place below, as `fit.poses`, and is of this kind."""
+
+    def value(owner: Any) -> Any:
+        return attrgetter(place)(owner)
+
+    value.__annotations__["return"] = kind
+    return property(value, doc=doc)  # type: ignore[return-value]
+
+
 @dataclass(frozen=True, eq=False)
 class RunData(Table, document="stitch.output.result_document:result_document", table="views"):
     """One session, its model and its results, as `result.json` and the report show them.
@@ -248,25 +260,41 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
         known = self.ledger[-1].heldout_rms if self.ledger else np.nan
         return known if np.isfinite(known) else self.residual_rms
 
-    @property
-    def T_mount(self) -> Array:
-        """(4, 4) corrected hand-eye."""
-        return self.model.T_mount
-
-    @property
-    def mount_covariance(self) -> Array:
-        """(6, 6) of the right perturbation T·exp(ξ), scanner frame, rotation first."""
-        return self.model.covariance
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """Effects in use."""
-        return self.model.terms
-
-    @property
-    def effects(self) -> list[str]:
-        """Names of the effects in use."""
-        return self.model.effects
+    T_mount = passed_on("model.T_mount", Array, "(4, 4) corrected hand-eye.")
+    mount_covariance = passed_on(
+        "model.covariance", Array, "(6, 6) of the right perturbation T·exp(ξ), scanner frame, rotation first."
+    )
+    terms = passed_on("model.terms", tuple[Term, ...], "Effects in use.")
+    effects = passed_on("model.effects", list[str], "Names of the effects in use.")
+    stages = passed_on(
+        "fit.stages", tuple[StageResult, ...], "Rows of the stage table: coarse, correct, register, fuse."
+    )
+    poses_model = passed_on(
+        "fit.poses_model", Array, "(V, 4, 4) T_reference_scanner of robot, hand-eye and effects alone, length_unit."
+    )
+    poses = passed_on("fit.poses", Array, "(V, 4, 4) T_reference_scanner after register, length_unit.")
+    corrections = passed_on(
+        "fit.corrections", Array, "(V, 6) twists, reference frame: poses = exp(corrections)·poses_model; length_unit."
+    )
+    view_rms = passed_on(
+        "fit.view_rms", Array, "(V,) rms of each view's distances from the others, length_unit; NaN without partners."
+    )
+    fused = passed_on("fit.fused", FusedCloud, "The stitched cloud as arrays, reference frame, length_unit.")
+    repeatability = passed_on(
+        "fit.repeatability", Repeatability, "Of the flange's poses, as the overlaps show it; rad and length_unit."
+    )
+    outliers = passed_on("fit.outliers", tuple[Outlier, ...], "Labelled points that do not count.")
+    unobservable = passed_on(
+        "fit.unobservable", tuple[str, ...], "Directions of the hand-eye that the views do not show, in plain words."
+    )
+    unknown = passed_on(
+        "fit.unknown", tuple[str, ...], "Of x, y, z, rx, ry, rz of the hand-eye, what those directions leave open."
+    )
+    verdict = passed_on("fit.verdict", str, "One plain sentence.")
+    convergence = passed_on(
+        "fit.convergence", dict[str, list[float]], "Stage to rms of each of its iterations, length_unit."
+    )
+    notes = passed_on("fit.notes", tuple[str, ...], "Sentences for people.")
 
     @cached_property
     def axes(self) -> tuple[AxisPlace, ...]:
@@ -277,43 +305,6 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
     def scanners(self) -> tuple[ScannerPlace, ...]:
         """Where several scanners stand, with U; none of one."""
         return scanner_places(self.measurement, self.model, self.alone)
-
-    # Fields of `fit`.
-
-    @property
-    def stages(self) -> tuple[StageResult, ...]:
-        """Rows of the stage table: coarse, correct, register, fuse."""
-        return self.fit.stages
-
-    @property
-    def poses_model(self) -> Array:
-        """(V, 4, 4) T_reference_scanner of robot, hand-eye and effects alone, length_unit."""
-        return self.fit.poses_model
-
-    @property
-    def poses(self) -> Array:
-        """(V, 4, 4) T_reference_scanner after register, length_unit."""
-        return self.fit.poses
-
-    @property
-    def corrections(self) -> Array:
-        """(V, 6) twists in the reference frame, poses = exp(corrections)·poses_model; rad and length_unit."""
-        return self.fit.corrections
-
-    @property
-    def view_rms(self) -> Array:
-        """(V,) rms of each view's distances from the others, length_unit; NaN for one without partners."""
-        return self.fit.view_rms
-
-    @property
-    def fused(self) -> FusedCloud:
-        """The stitched cloud as arrays, reference frame, length_unit."""
-        return self.fit.fused
-
-    @property
-    def repeatability(self) -> Repeatability:
-        """Of the flange's poses, as the overlaps show it; rad and length_unit."""
-        return self.fit.repeatability
 
     @property
     def overlaps(self) -> Overlaps | None:
@@ -329,36 +320,6 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
     def targets(self) -> TargetModelFit | None:
         """What the labelled points say; None where there are none."""
         return self.fit.targets
-
-    @property
-    def outliers(self) -> tuple[Outlier, ...]:
-        """Labelled points that do not count."""
-        return self.fit.outliers
-
-    @property
-    def unobservable(self) -> tuple[str, ...]:
-        """Directions of the hand-eye that the views do not show, in plain words."""
-        return self.fit.unobservable
-
-    @property
-    def unknown(self) -> tuple[str, ...]:
-        """Of x, y, z, rx, ry, rz of the hand-eye, what those directions leave open."""
-        return self.fit.unknown
-
-    @property
-    def verdict(self) -> str:
-        """One plain sentence."""
-        return self.fit.verdict
-
-    @property
-    def convergence(self) -> dict[str, list[float]]:
-        """Stage to rms of each of its iterations, length_unit."""
-        return self.fit.convergence
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences for people."""
-        return self.fit.notes
 
     def __repr__(self) -> str:
         unit = self.session.length_unit

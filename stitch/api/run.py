@@ -25,7 +25,7 @@ from stitch.output.json_file import to_json
 from stitch.output.result_document import effects_source, ledger, points_of
 from stitch.output.run_folder import recordings, residual_table
 from stitch.output.stored_run import read_ledger
-from stitch.recorder import Recorder
+from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import FusedCloud, RunData, StageResult
 from stitch.session.capture import Capture
 from stitch.session.reading.session_folder import content_hash, measured_files
@@ -353,7 +353,7 @@ class Run(RunData):
         return fit_report(self, self.hand_eye.U)
 
 
-class ReplayRecorder:
+class ReplayRecorder(RecorderMemory):
     """Recorder that keeps its calls, so that a recording can be written once the run is saved; it logs every stage.
 
     Args:
@@ -362,36 +362,31 @@ class ReplayRecorder:
     """
 
     def __init__(self, other: Recorder | None = None, progress: Callable[[str], object] | None = None) -> None:
-        self.other = other
+        super().__init__()
+        self.other = other or SilentRecorder()
         self.progress = progress
-        self.calls: list[tuple[str, tuple[Any, ...]]] = []
 
-    def start(self, session: SessionData) -> None:
-        """Keep the session; a run that leaves views out starts anew with the others."""
-        self._keep("start", session)
+    def tell(self, call: str, *arguments: Any) -> None:
+        """Keep one call, and pass it on."""
+        super().tell(call, *arguments)
+        getattr(self.other, call)(*arguments)
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep one iteration."""
+        """Log one iteration."""
         _LOG.debug("%s, iteration %d: rms %.4g within %.4g", stage, index, rms, gate)
-        self._keep("iteration", stage, index, poses, rms, gate)
+        super().iteration(stage, index, poses, rms, gate)
 
     def stage(self, result: StageResult, poses: Array) -> None:
-        """Keep the end of a stage, and say it."""
+        """Say the end of a stage."""
         line = f"{result.name}: rms {result.rms:.4g}, {result.seconds:.1f} s"
         _LOG.info("%s", line)
         if self.progress is not None:
             self.progress(line)
-        self._keep("stage", result, poses)
+        super().stage(result, poses)
 
     def finish(self, run: RunData) -> None:
         """Pass on alone: `Run.save` finishes the recording."""
-        if self.other is not None:
-            self.other.finish(run)
-
-    def _keep(self, call: str, *arguments: Any) -> None:
-        self.calls.append((call, arguments))
-        if self.other is not None:
-            getattr(self.other, call)(*arguments)
+        self.other.finish(run)
 
 
 def public_run(run: RunData, whole: Session | None, recorder: ReplayRecorder | None = None) -> Run:

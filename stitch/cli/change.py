@@ -101,7 +101,7 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
             result = with_prediction(result, _predicted(standing, state, effects))
             if told := _as_good(standing, state, effects):
                 result = result.with_fit(notes=(told, *result.notes))
-            memory.tell(recorder_for(scratch, recording, run), result)
+            memory.replay_run(recorder_for(scratch, recording, run), result)
             run_folder.write_with_page(result, scratch)
     _show_changed(result, run, as_json)
     if not as_json:
@@ -162,7 +162,7 @@ def _add_diagnosed(
             if not as_json:
                 _show_changed(result, run, as_json)
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
-                memory.tell(recorder_for(scratch, recording, run), result)
+                memory.replay_run(recorder_for(scratch, recording, run), result)
                 run_folder.write_with_page(result, scratch)
             if as_json:
                 _show_changed(result, run, as_json)
