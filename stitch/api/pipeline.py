@@ -101,8 +101,7 @@ def run_rig(
     """
     method_named(register)
     require_same_rig(sessions, model)
-    for session in sessions:
-        require_rising_times(session)
+    require_measured_once(sessions)
     if model:
         sessions = [with_model_axes(session, model) for session in sessions]
     recorders = recorders or [SilentRecorder() for _ in sessions]
@@ -110,15 +109,11 @@ def run_rig(
         clock = Clock()
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
-        prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
-        measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
         effects = list(dict.fromkeys(effects))
         model = without_events(convert_unit(model, sessions[0].length_unit)) if model else None
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
-        require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
-        require_measured_once(sessions)
-        if sessions[0].axes:
-            sessions, measurements = locate_axes(sessions, measurements)
+        asked = [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())]
+        sessions, measurements = _measured(sessions, captures, asked)
         hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
         measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
         seconds = clock.lap()
@@ -167,10 +162,7 @@ def join_scanners(
     if model:
         return join_sessions(with_model_scanners(sessions, convert_unit(model, sessions[0].length_unit)))
     with library_threads_off():
-        prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
-        measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
-        if sessions[0].axes:
-            sessions, measurements = locate_axes(sessions, measurements)
+        sessions, measurements = _measured(sessions, captures)
         placed = []
         for session, measurement in zip(sessions, measurements, strict=True):
             try:
@@ -183,15 +175,36 @@ def join_scanners(
         return join_sessions(placed)
 
 
+def _measured(
+    sessions: Sequence[SessionData], captures: Sequence[Future[Capture]] | None, effects: Sequence[str] = ()
+) -> tuple[Sequence[SessionData], Sequence[Measurement]]:
+    """Return sessions whose external axes are located, and what was measured in them; effects that they cannot have are
+    refused."""
+    prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
+    measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
+    require_effects(measurements, effects)
+    return locate_axes(sessions, measurements) if sessions[0].axes else (sessions, measurements)
+
+
 def _fit_alone(session: SessionData, measurement: Measurement, arm: ModelFile | None) -> Correction:
     """Return what the views of one scanner say by themselves."""
-    steps = pipeline_for(session)
-    hand_eyes = steps.start([session], [measurement], None)
+    hand_eyes = pipeline_for(session).start([session], [measurement], None)
     measurement = with_part_origin(measurement, hand_eyes[0].T_mount)
-    start = FitStart(hand_eyes, _initial_model(session, (), arm))
-    correction = steps.fit([session], [measurement], start, SilentRecorder()).correction
+    correction = _fit_unseen([session], [measurement], hand_eyes, (), arm).correction
     assert correction is not None
     return correction
+
+
+def _fit_unseen(
+    sessions: Sequence[SessionData],
+    measurements: Sequence[Measurement],
+    hand_eyes: Sequence[CoarseHandEye],
+    effects: Sequence[str],
+    arm: ModelFile | None,
+) -> FittedRig:
+    """Return sessions fitted beside the run, which no recorder is told of."""
+    start = FitStart(hand_eyes, _initial_model(sessions[0], effects, arm))
+    return pipeline_for(sessions[0]).fit(sessions, measurements, start, SilentRecorder())
 
 
 def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlone, ...]:
@@ -210,7 +223,7 @@ def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlo
 
 
 def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
-    """Refuse sessions that cannot share a hand-eye, or that show nothing.
+    """Refuse sessions that cannot share a hand-eye, whose times fall, or that show nothing.
 
     Raises:
         InputError: names the session and what is wrong.
@@ -232,6 +245,7 @@ def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -
             "the folder of this session within that run (--hand-eye RUN/SESSION)"
         )
     for session in sessions:
+        require_rising_times(session)
         if not session.has_clouds and not session.has_sightings:
             raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
         if session.has_clouds != first.has_clouds:
@@ -371,20 +385,11 @@ class _Conductor:
             if memories[0].stopped:
                 raise CancelledError
 
+        of_session = partial(steps.finish, seconds=self._seconds, method=self._register, until_screened=until_screened)
+
         def finish() -> list[tuple[Fit, float]]:
-            return [
-                steps.finish(
-                    session,
-                    fitted,
-                    i,
-                    self._coarse[i],
-                    memories[i],
-                    seconds=self._seconds,
-                    method=self._register,
-                    until_screened=until_screened,
-                )
-                for i, session in enumerate(sessions)
-            ]
+            every = enumerate(zip(sessions, self._coarse, memories, strict=True))
+            return [of_session(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
 
         self._statistics = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
         self._finished = begin(finish)
@@ -422,13 +427,11 @@ def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: 
 
 def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
     """Hold labelled points under the model of another run against a fit of hand-eye and targets from themselves."""
-    session = screened.sessions[0]
-    steps = pipeline_for(session)
+    seen = screened.sessions, screened.measurements
 
     def fit() -> FittedRig:
-        hand_eyes = steps.start(screened.sessions, screened.measurements, None)
-        start = FitStart(hand_eyes, _initial_model(session, effects, arm_model(model)))
-        return steps.fit(screened.sessions, screened.measurements, start, SilentRecorder())
+        hand_eyes = pipeline_for(screened.sessions[0]).start(*seen, None)
+        return _fit_unseen(*seen, hand_eyes, effects, arm_model(model))
 
     return screened.with_doubts(check_model_transfer(screened.sessions, screened.fitted, fit))
 
@@ -437,24 +440,22 @@ def _check_common_model(
     screened: ScreenedFit, hand_eyes: Sequence[CoarseHandEye], effects: Sequence[str], arm: ModelFile | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return notes on, and doubts of, what the sessions share: effects, and the arm of another run."""
-    first = screened.sessions[0]
-    steps = pipeline_for(first)
+    sessions, measurements = screened.sessions, screened.measurements
+    unit = sessions[0].length_unit
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
 
     def fit_session(i: int) -> FittedRig:
-        start = FitStart([hand_eyes[i]], _initial_model(first, effects, arm))
-        return steps.fit([screened.sessions[i]], [screened.measurements[i]], start, SilentRecorder())
+        return _fit_unseen([sessions[i]], [measurements[i]], [hand_eyes[i]], effects, arm)
 
     def fit_with_arm(other: ModelFile | None) -> FittedRig:
-        start = FitStart(hand_eyes, _initial_model(first, effects, other))
-        return steps.fit(screened.sessions, screened.measurements, start, SilentRecorder())
+        return _fit_unseen(sessions, measurements, hand_eyes, effects, other)
 
-    if len(screened.sessions) > 1 and effects:
-        apart = find_disagreeing_sessions([s.name for s in screened.sessions], screened.fitted, fit_session)
-        doubts = tuple(disagreement.doubt(first.length_unit) for disagreement in apart)
+    if len(sessions) > 1 and effects:
+        apart = find_disagreeing_sessions([s.name for s in sessions], screened.fitted, fit_session)
+        doubts = tuple(disagreement.doubt(unit) for disagreement in apart)
     if arm:
-        holds, sentence = check_arm_transfer(fit_with_arm, arm, screened.fitted, first.length_unit)
+        holds, sentence = check_arm_transfer(fit_with_arm, arm, screened.fitted, unit)
         if holds:
             notes = (sentence,)
         else:

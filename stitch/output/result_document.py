@@ -351,29 +351,7 @@ def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
     """Return where several scanners stand, and what the views of each say by themselves."""
     parts = {part.scanner.name: part for part in run.session.parts}
     return [
-        {
-            "scanner": place.name,
-            "session": parts[place.name].name,
-            "hand_eye": plain(place.T_mount),
-            "hand_eye_sigma": plain(place.sigma),
-            "hand_eye_covariance": plain(place.covariance),
-            "unobservable": list(place.unobservable),
-            "hand_eye_unknown": list(place.unknown),
-            "U": place.U,
-        }
-        | (
-            {}
-            if place.alone is None
-            else {
-                "alone": {
-                    "hand_eye": plain(place.alone.hand_eye),
-                    "hand_eye_covariance": plain(place.alone.covariance),
-                    "U": place.U_alone,
-                    "apart": place.apart,
-                }
-            }
-        )
-        for place in run.scanners
+        {"scanner": place.name, "session": parts[place.name].name} | _SCANNER.write(place) for place in run.scanners
     ]
 
 
@@ -503,6 +481,21 @@ _ALONE = Document(
     Key("covariance", Kind(list_of(list_of(NUMBER)).schema)),
     Key("displacement", NUMBER),
     Key("spread", NUMBER),
+)
+_SCANNER_ALONE = Document(
+    Key("hand_eye", attribute="alone.hand_eye"),
+    Key("hand_eye_covariance", attribute="alone.covariance"),
+    Key("U", attribute="U_alone"),
+    Key("apart"),
+)
+_SCANNER = Document(
+    Key("hand_eye", attribute="T_mount"),
+    Key("hand_eye_sigma", attribute="sigma"),
+    Key("hand_eye_covariance", attribute="covariance"),
+    Key("unobservable"),
+    Key("hand_eye_unknown", attribute="unknown"),
+    Key("U"),
+    Key("alone", write=_SCANNER_ALONE.write, when=attrgetter("alone")),
 )
 _SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
 _STOCK = Document(

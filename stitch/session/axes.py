@@ -20,6 +20,7 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES
+from stitch.system.values import take_rows
 
 KINDS = ("rotary", "linear")
 
@@ -152,7 +153,7 @@ class Axes:
 
     def only(self, keep: Sequence[int]) -> "Axes":
         """Return the axes in some of the views."""
-        return replace(self, readings=self.readings[list(keep)], approach=self.approach[list(keep)])
+        return take_rows(self, list(keep), "readings", "approach")
 
     def standing(self, count: int) -> "Axes":
         """Return the axes in so many views in which they stand as in the last one."""

@@ -24,6 +24,7 @@ from stitch.session.scan import (
 from stitch.session.scanners import scanner_of, scanners_of, stops_of
 from stitch.session.session import Cloud, Scanner, SessionData
 from stitch.system.threads import parallel
+from stitch.system.values import take_rows
 
 # Where neither a row nor scanner.noise says how well the sensor sees: what a good one does, in metres. The factor
 # on the noise is estimated from the data anyway.
@@ -63,9 +64,7 @@ class Sightings:
     def without(self, left_out: Indices) -> "Sightings":
         """Return the sightings less some views."""
         keep = np.setdiff1d(np.arange(len(self.points)), left_out)
-        of_views = ("target", "points", "sigma", "used", "rotation", "sigma_rotation")
-        known = {name: values for name in of_views if (values := getattr(self, name)) is not None}
-        return replace(self, **{name: values[keep] for name, values in known.items()})
+        return take_rows(self, keep, "target", "points", "sigma", "used", "rotation", "sigma_rotation")
 
 
 @dataclass(frozen=True)
@@ -145,14 +144,10 @@ class Capture:
     def without(self, left_out: Indices) -> "Capture":
         """Return the capture less some views."""
         keep = np.setdiff1d(np.arange(len(self.T_reference_mount)), left_out)
+        of_views = ("scans", "T_reference_mount", "T_reference_flange", "T_behind_mount", "scanner")
         return replace(
-            self,
-            scans=tuple(self.scans[v] for v in keep) if self.scans else (),
-            T_reference_mount=self.T_reference_mount[keep],
-            T_reference_flange=self.T_reference_flange[keep],
-            T_behind_mount=None if self.T_behind_mount is None else self.T_behind_mount[keep],
+            take_rows(self, keep, *of_views),
             sightings=None if self.sightings is None else self.sightings.without(left_out),
-            scanner=None if self.scanner is None else self.scanner[keep],
             stop=None if self.stop is None else np.unique(self.stop[keep], return_inverse=True)[1],
         )
 

@@ -23,6 +23,7 @@ from stitch.session.robot import Robot
 from stitch.session.scanners import Scanners, scanners_of
 from stitch.session.session import Mount, SensorKind, SessionData
 from stitch.session.torques import Torques, no_torques, torque_columns, torques_of_views
+from stitch.system.values import take_rows
 
 TURNED = 0.02  # rad by which gravity turns at the least: of what holds still it is a part of the hand-eye
 # Columns of temperatures of which each may bend an arm, by their number in a model.
@@ -41,6 +42,8 @@ _SAME_FRAME = 0.05
 _WIDEST = 0.26
 # Points of a view that say where a sensor looks.
 _ENOUGH = 1000
+# Fields of `Views` with a row a view.
+_OF_VIEWS = ("time", "joints", "previous", "approach", "velocity", "covariates", "number", "T_base_flange")
 
 
 @dataclass(frozen=True)
@@ -145,20 +148,11 @@ class Views:
     def only(self, keep: Sequence[int]) -> "Views":
         """Return some of the views; their numbers, rows before them and first values stay those of the session."""
         return replace(
-            self,
+            take_rows(self, keep, *_OF_VIEWS, *(["gravity"] if self.gravity.ndim > 1 else [])),
             count=len(keep),
-            time=self.time[keep],
-            joints=self.joints[keep],
-            previous=self.previous[keep],
-            approach=self.approach[keep],
-            velocity=None if self.velocity is None else self.velocity[keep],
             torques=self.torques.only(keep),
-            covariates={name: values[keep] for name, values in self.covariates.items()},
-            number=self.number[keep],
             axes=self.axes.only(keep) if self.axes else self.axes,
             scanners=self.scanners.only(keep),
-            gravity=self.gravity if self.gravity.ndim == 1 else self.gravity[keep],
-            T_base_flange=self.T_base_flange[keep],
         )
 
     def has(self, need: str) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.system.values import take_rows
 
 # Neighbours of a point's local plane: enough to average the noise, few enough to follow a fillet. To the quadric of the
 # noise estimate, of six coefficients, they leave ten degrees of freedom, and stay within one curve of the surface where
@@ -181,18 +182,10 @@ def subsample(scan: Scan, at_most: int) -> Scan:
     if len(scan.points) <= at_most:
         return scan
     picked = even_indices(len(scan.points), at_most)
-    points = np.ascontiguousarray(scan.points[picked])
-    tree = KDTree(points, leafsize=16)
-    return replace(
-        scan,
-        points=points,
-        normals=scan.normals[picked],
-        usable=scan.usable[picked],
-        area=scan.area[picked] * (len(scan.points) / at_most),
-        confidence=scan.confidence[picked],
-        tree=tree,
-        spacing=_estimate_spacing(points, tree),
-    )
+    few = take_rows(scan, picked, "points", "normals", "usable", "area", "confidence")
+    tree = KDTree(few.points, leafsize=16)
+    area = few.area * (len(scan.points) / at_most)
+    return replace(few, area=area, tree=tree, spacing=_estimate_spacing(few.points, tree))
 
 
 def even_indices(count: int, at_most: int) -> Indices:

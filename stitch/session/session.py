@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.errors import InputError
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.session.axes import Axis
 from stitch.session.robot import Robot
 from stitch.session.scan import Scan, bounding_box
-from stitch.system.values import Value
+from stitch.system.values import Value, take_rows
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 SensorKind = Literal["area", "line", "tracker", "probe", "camera"]
@@ -39,9 +39,11 @@ class Cloud:
 
     def within(self, box: Array) -> "Cloud":
         """Return the cloud of its points inside a box (2, 3)."""
-        inside = ((self.points >= box[0]) & (self.points <= box[1])).all(axis=1)
-        scalars = {name: column[inside] for name, column in self.scalars.items()}
-        return Cloud(self.points[inside], None if self.normals is None else self.normals[inside], scalars)
+        return self.at(((self.points >= box[0]) & (self.points <= box[1])).all(axis=1))
+
+    def at(self, index: Indices | Mask) -> "Cloud":
+        """Return the cloud of some of its points, and of nothing else."""
+        return take_rows(Cloud(self.points, self.normals, self.scalars), index, "points", "normals", "scalars")
 
 
 @dataclass(frozen=True)

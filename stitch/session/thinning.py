@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.numerics.frames import Indices
 from stitch.session.capture import Capture, prepare_capture
 from stitch.session.scan import bounding_box, even_indices, prepare_scan, subsample
 from stitch.session.session import Cloud, Scanner, SessionData, View, WholeCloud
 from stitch.system.threads import parallel
+from stitch.system.values import take_rows
 
 # Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most. Hand-eye and
 # fused surface are then as near to the truth as with all points (docs/large-sessions.md).
@@ -72,17 +72,12 @@ def thin_cloud(
     if len(picked) == len(cloud.points):
         return cloud
     if cloud.whole is not None:
-        return _take_points(cloud, picked, replace(cloud.whole, scan=subsample(cloud.whole.scan, at_most)))
-    scan = prepare_scan(name, cloud.points, picked, scanner.eye(cloud.points))
-    whole = WholeCloud(reload or (lambda: cloud), len(cloud.points), bounding_box(cloud.points), scan)
-    return _take_points(cloud, picked, whole)
-
-
-def _take_points(cloud: Cloud, index: Indices, whole: WholeCloud) -> Cloud:
-    """Return some of the points; those of the scan are the same, so that memory holds them once."""
-    normals = None if cloud.normals is None else cloud.normals[index]
-    scalars = {name: values[index] for name, values in cloud.scalars.items()}
-    return Cloud(whole.scan.points, normals, scalars, whole)
+        whole = replace(cloud.whole, scan=subsample(cloud.whole.scan, at_most))
+    else:
+        scan = prepare_scan(name, cloud.points, picked, scanner.eye(cloud.points))
+        whole = WholeCloud(reload or (lambda: cloud), len(cloud.points), bounding_box(cloud.points), scan)
+    # The points are those of the scan, so that memory holds them once.
+    return replace(cloud.at(picked), points=whole.scan.points, whole=whole)
 
 
 def distinct_points(cloud: Cloud) -> Cloud:
@@ -97,7 +92,4 @@ def distinct_points(cloud: Cloud) -> Cloud:
     _, first = np.unique(cloud.points, axis=0, return_index=True)
     if len(first) == len(cloud.points):
         return cloud
-    first.sort()
-    normals = None if cloud.normals is None else cloud.normals[first]
-    scalars = {name: values[first] for name, values in cloud.scalars.items()}
-    return replace(cloud, points=cloud.points[first], normals=normals, scalars=scalars)
+    return take_rows(cloud, np.sort(first), "points", "normals", "scalars")

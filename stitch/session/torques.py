@@ -10,6 +10,7 @@ import numpy as np
 from stitch.numerics.frames import Array
 from stitch.session import robot as kinematics
 from stitch.session.robot import Robot
+from stitch.system.values import take_rows
 
 PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
 # So many joint angles show which torques of an arm differ.
@@ -32,7 +33,7 @@ class Torques:
 
     def only(self, keep: Sequence[int]) -> "Torques":
         """Return those of some of the views."""
-        return replace(self, values=self.values[keep], base=self.base[keep] if self.base_names else self.base)
+        return take_rows(self, keep, *(["values", "base"] if self.base_names else ["values"]))
 
     def followed_by(self, later: "Torques") -> "Torques":
         """Return those of these views and of later ones."""

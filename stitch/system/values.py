@@ -5,14 +5,16 @@ table. The place is a text, as of an entry point: the class stands below the roo
 """
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pkgutil import resolve_name
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from stitch.system.packages import import_extra
+
+Item = TypeVar("Item")
 
 
 class Value:
@@ -82,6 +84,20 @@ class Table(Value):
             5
         """
         return import_extra("pandas", "to_pandas", "tables").DataFrame(self.rows())
+
+
+def take_rows(item: Item, index: Any, *names: str) -> Item:
+    """Return a dataclass with some rows of what its fields of these names hold: arrays, tables of them, or tuples.
+
+    A field without rows, None or (), stays.
+    """
+
+    def rows(held: Any) -> Any:
+        if held is None or isinstance(held, tuple):
+            return held and tuple(held[i] for i in index)
+        return {name: column[index] for name, column in held.items()} if isinstance(held, dict) else held[index]
+
+    return replace(item, **{name: rows(getattr(item, name)) for name in names})  # type: ignore[type-var]
 
 
 def same(a: Any, b: Any) -> bool:

@@ -37,7 +37,7 @@ from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors, white_sca
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
-from stitch.system.values import Value
+from stitch.system.values import Value, take_rows
 
 # Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
 SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
@@ -106,16 +106,12 @@ class CaptureEvidence:
         """Return the same without some views."""
         g = self.gram
         keep = np.asarray(~np.isin(g.pairs, views).any(axis=1))
-        number = np.cumsum(~np.isin(np.arange(g.views), views)) - 1
-        rows = (6 * views[:, None] + np.arange(6)).ravel()
-        return CaptureEvidence(
-            capture=self.capture.without(views),
-            gram=replace(g.only(keep), views=g.views - len(views), pairs=number[g.pairs[keep]]),
-            twists=np.delete(self.twists, views, 0),
-            hand_eye_frames=np.delete(self.hand_eye_frames, views, 0),
-            effect_twists=np.delete(self.effect_twists, rows, axis=0),
-            common_twists=np.delete(self.common_twists, rows, axis=0),
-        )
+        stays = ~np.isin(np.arange(g.views), views)
+        number = np.cumsum(stays) - 1
+        gram = replace(g.only(keep), views=g.views - len(views), pairs=number[g.pairs[keep]])
+        kept = take_rows(self, stays, "twists", "hand_eye_frames")
+        kept = take_rows(kept, np.repeat(stays, 6), "effect_twists", "common_twists")
+        return replace(kept, capture=self.capture.without(views), gram=gram)
 
     def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
         """Return Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""

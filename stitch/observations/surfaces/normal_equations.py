@@ -34,7 +34,7 @@ from stitch.observations.surfaces.matching import Match, Searched, match_pairs, 
 from stitch.observations.surfaces.partners import find_partners, more_points
 from stitch.session.capture import Capture, Sightings
 from stitch.session.scan import Scan, centroid
-from stitch.system.values import Value
+from stitch.system.values import Value, take_rows
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000
@@ -226,7 +226,7 @@ class Gram:
 
     def only(self, keep: Mask) -> "Gram":
         """Return the sums of some pairs (P,)."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in _PAIR_FIELDS})
+        return take_rows(self, keep, *_PAIR_FIELDS)
 
     @property
     def variance(self) -> float:
