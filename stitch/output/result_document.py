@@ -265,11 +265,6 @@ def _target_rows(run: RunData) -> list[dict[str, Any]]:
     ]
 
 
-def _target_distances(run: RunData) -> Array:
-    assert run.targets is not None
-    return run.targets.rows.distances(run.targets.rows.residual)
-
-
 def _sizes(distances: Array) -> dict[str, float]:
     known = distances[np.isfinite(distances)]
     return {"mean": float(known.mean()), "median": float(np.median(known)), "max": float(known.max())}
@@ -338,15 +333,6 @@ def stock_of_views(document: dict[str, Any], names: Sequence[str]) -> dict[int, 
     return {names.index(r.view): Stock(r.thickness, r.sigma, r.share, nowhere) for r in rows if r.view in names}
 
 
-def _axis_rows(run: RunData) -> list[dict[str, Any]]:
-    """Return where the axes stand; a sigma is null where the views do not show it."""
-    return [{key: plain(value) for key, value in vars(place).items() if value is not None} for place in run.axes]
-
-
-def _session_paths(run: RunData) -> list[str]:
-    return [str(part.path.resolve()) for part in run.session.parts]
-
-
 def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
     """Return where several scanners stand, and what the views of each say by themselves."""
     parts = {part.scanner.name: part for part in run.session.parts}
@@ -410,11 +396,6 @@ def scanners_alone(document: dict[str, Any]) -> tuple[ScannerAlone, ...]:
         ScannerAlone(name, np.array(own["hand_eye"], float), np.array(own["hand_eye_covariance"], float))
         for name, own in rows
     )
-
-
-def _known_anywhere(run: RunData) -> bool:
-    """Return whether the hand-eye's sigma anywhere the arm reaches is known."""
-    return run.fit.sigma_anywhere is not None
 
 
 def _disagreement(run: RunData) -> dict[str, Any] | None:
@@ -521,14 +502,18 @@ _COVARIANCE = Document(
 )
 _OUTLIER = Document(Key("view", TEXT), Key("target", Kind({"type": ["string", "null"]})))
 _DISAGREEMENT = Kind({"type": ["object", "null"], "properties": {"gate": NUMBER.schema}})
-_PATH = Kind({"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000})
+_PATH = Kind(
+    {"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000}, lambda session: str(session.path.resolve())
+)
+# A sigma is null where the views do not show it.
+_AXIS = Kind({}, lambda place: {key: plain(value) for key, value in vars(place).items() if value is not None})
 _SIZES = Kind({"type": "object"}, _sizes)
 _NUMBERS = Kind(list_of(NUMBER_OR_NULL).schema, read=lambda values: [number(value) for value in values])
 # Lengths in length_unit, angles in rad; twists and covariances rotation first.
 RESULT = Document(
     Key("format", write=lambda run: FORMAT),
-    Key("session", _PATH, write=lambda run: str(run.session.path.resolve())),
-    Key("sessions", list_of(_PATH), write=_session_paths, when=attrgetter("session.parts")),
+    Key("session", _PATH, "session"),
+    Key("sessions", list_of(_PATH), "session.parts", when=attrgetter("session.parts")),
     Key("scanner", attribute="session.scanner.name", when=attrgetter("session.scanner.name")),
     Key("scanners", write=_scanner_rows, when=attrgetter("session.parts")),
     Key("name", attribute="session.name"),
@@ -538,7 +523,13 @@ RESULT = Document(
     Key("hand_eye", MATRIX, "T_mount"),
     Key("hand_eye_coarse", attribute="T_mount_coarse"),
     Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
-    Key("hand_eye_sigma_anywhere", array_of(6), "fit.sigma_anywhere", of=Fit, when=_known_anywhere),
+    Key(
+        "hand_eye_sigma_anywhere",
+        array_of(6),
+        "fit.sigma_anywhere",
+        of=Fit,
+        when=lambda r: r.fit.sigma_anywhere is not None,
+    ),
     Key("hand_eye_covariance", attribute="mount_covariance"),
     Key("hand_eye_alone", _ALONE.kind(), write=_hand_eye_alone, when=_hand_eye_alone),
     Key("unobservable", TEXTS, of=Fit),
@@ -551,14 +542,14 @@ RESULT = Document(
     Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
     Key("effects", _EFFECTS, "terms"),
     Key("effects_covariance", _COVARIANCE.kind(), "model.effects_covariance", optional=True),
-    Key("axes", write=_axis_rows, when=attrgetter("session.axes")),
+    Key("axes", list_of(_AXIS), when=attrgetter("session.axes")),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
     Key("stock", _STOCK.rows(), write=_stock_rows, when=_has_stock),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
     Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
-    Key("position_error", _SIZES, write=_target_distances, when=attrgetter("targets")),
+    Key("position_error", _SIZES, "targets.distances", when=attrgetter("targets")),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
     Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_labelled_beside_clouds),
     Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_labelled_alone),

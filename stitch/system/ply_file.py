@@ -8,7 +8,7 @@ length.
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -178,16 +178,22 @@ def _read_binary_lists(stream: BinaryIO, element: _Element, order: str) -> Colum
     """Return the properties of an element with lists: in one go where all lists of a property are equally long."""
     start = stream.tell()
     data = stream.read()
-    lengths = _lengths_in_row(data, element, order)
+    first, _ = _walk_rows(data, replace(element, count=min(element.count, 1)), order)
+    lengths = {name: int(column.lengths.sum()) for name, column in first.items() if isinstance(column, Lists)}
     layout = np.dtype(_fields_of_row(element, order, lengths))
     if layout.itemsize * element.count <= len(data):
         rows: NDArray[np.void] = np.frombuffer(data, layout, element.count)
         if all((rows[f"{name} length"] == length).all() for name, length in lengths.items()):
             stream.seek(start + layout.itemsize * element.count)
-            return {p.name: _column_of(rows, p) for p in element.properties}
-    offsets, size = _walk_rows(data, element, order)
+            return {
+                name: Lists(rows[f"{name} length"].astype(np.int64), rows[name].reshape(-1))
+                if name in lengths
+                else rows[name]
+                for name in first
+            }
+    columns, size = _walk_rows(data, element, order)
     stream.seek(start + size)
-    return {p.name: _gather(data, p, offsets[p.name], order) for p in element.properties}
+    return columns
 
 
 def _fields_of_row(element: _Element, order: str, lengths: Mapping[str, int]) -> list[tuple[str, Any]]:
@@ -200,46 +206,27 @@ def _fields_of_row(element: _Element, order: str, lengths: Mapping[str, int]) ->
     return fields
 
 
-def _lengths_in_row(data: bytes, element: _Element, order: str) -> dict[str, int]:
-    """Return the lengths of the lists in the first row."""
-    first = _Element(element.name, min(element.count, 1), element.properties)
-    offsets, _ = _walk_rows(data, first, order)
-    return {p.name: sum(length for _, length in offsets[p.name]) for p in element.properties if p.length_kind}
-
-
-def _column_of(rows: NDArray[np.void], p: _Property) -> NDArray[Any] | Lists:
-    if not p.length_kind:
-        return rows[p.name]
-    return Lists(rows[f"{p.name} length"].astype(np.int64), rows[p.name].reshape(-1))
-
-
-def _walk_rows(data: bytes, element: _Element, order: str) -> tuple[dict[str, list[tuple[int, int]]], int]:
-    """Return where each property of each row begins and how many numbers it has, and the bytes of all rows."""
+def _walk_rows(data: bytes, element: _Element, order: str) -> tuple[Columns, int]:
+    """Return the properties of an element with lists, read row by row, and the bytes of all rows."""
     big = "big" if order == ">" else "little"
-    steps = [(p.name, int(p.length_kind[1:] or 0) if p.length_kind else 0, int(p.kind[1:])) for p in element.properties]
-    offsets: dict[str, list[tuple[int, int]]] = {p.name: [] for p in element.properties}
+    steps = [(p.name, int(p.length_kind[1:]) if p.length_kind else 0, int(p.kind[1:])) for p in element.properties]
+    lengths: dict[str, list[int]] = {p.name: [] for p in element.properties}
+    parts: dict[str, list[bytes]] = {p.name: [] for p in element.properties}
     at = 0
     for _ in range(element.count):
         for name, length_bytes, number_bytes in steps:
             length = int.from_bytes(data[at : at + length_bytes], big) if length_bytes else 1  # type: ignore[arg-type]
-            at += length_bytes
-            offsets[name].append((at, length))
-            at += length * number_bytes
+            start = at + length_bytes
+            at = start + length * number_bytes
+            lengths[name].append(length)
+            parts[name].append(data[start:at])
         if at > len(data):
             raise PlyError(f"ends early: {element.count} of {element.name} are announced")
-    return offsets, at
-
-
-def _gather(data: bytes, p: _Property, offsets: list[tuple[int, int]], order: str) -> NDArray[Any] | Lists:
-    """Return the numbers that lie at offsets of the data."""
-    places = np.array(offsets, np.int64).reshape(-1, 2)
-    lengths = places[:, 1]
-    size = int(p.kind[1:])
-    inside = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    starts = np.repeat(places[:, 0], lengths) + size * inside
-    numbers = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(size)]
-    values = np.ascontiguousarray(numbers).view(order + p.kind)[:, 0] if len(numbers) else np.empty(0, order + p.kind)
-    return Lists(lengths, values) if p.length_kind else values
+    columns = Columns()
+    for p in element.properties:
+        values = np.array(np.frombuffer(b"".join(parts[p.name]), order + p.kind))
+        columns[p.name] = Lists(np.array(lengths[p.name], np.int64), values) if p.length_kind else values
+    return columns, at
 
 
 def _read_text(stream: BinaryIO, element: _Element) -> Columns:

@@ -33,9 +33,14 @@ class TargetModelFit(Value):
     history: tuple[float, ...]  # 3D rms per iteration
 
     @property
+    def distances(self) -> Array:
+        """(V, S) 3D distances of the targets from their places; NaN where none was seen."""
+        return self.rows.distances(self.rows.residual)
+
+    @property
     def rms(self) -> float:
         """Root mean square, in 3D, over all targets of all views."""
-        return rms_of(self.rows.distances(self.rows.residual))
+        return rms_of(self.distances)
 
     @property
     def heldout_rms(self) -> float:
@@ -51,15 +56,14 @@ class TargetModelFit(Value):
     @property
     def target_rms(self) -> Array:
         """(K,) rms distance of the views from every target; NaN for one that nobody sees."""
-        s, distances = self.rows.sightings, self.rows.distances(self.rows.residual)
-        return np.array(
-            [rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in enumerate(s.view_counts)]
-        )
+        s, distances = self.rows.sightings, self.distances
+        seen = enumerate(s.view_counts)
+        return np.array([rms_of(distances[s.used & (s.target == k)]) if n else np.nan for k, n in seen])
 
     @property
     def view_squares(self) -> Array:
         """(V,) mean square distance of the targets in every view; NaN where none was seen: no perfect view."""
-        distances = self.rows.distances(self.rows.residual)
+        distances = self.distances
         seen = np.isfinite(distances).sum(axis=1)
         return np.where(seen > 0, np.nansum(distances**2, axis=1) / np.maximum(seen, 1), np.nan)
 

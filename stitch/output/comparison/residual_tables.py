@@ -25,6 +25,7 @@ from stitch.numerics.units import covariate_unit
 from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
+from stitch.output.schema import Document, Key
 from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
@@ -41,6 +42,11 @@ _DIRECTIONS = 3  # among so many dimensions a direction is chosen for every tabl
 _SAME_VALUE = 1e-9  # numbers closer than that are one
 # Of the size of the largest mean: sums of the same rows in another order differ by rounding.
 _ROUNDING = 1e-6
+
+_FOLLOWED = Document(
+    *map(Key, ("covariate", "unit", "place", "shape", "p_value", "p_beside", "direction", "mean", "sigma")),
+    Key("at", attribute="bins"),
+)
 
 # Name, unit and value of everything that is known, of the views (V,) or of the rows (N,).
 Properties = list[tuple[str, str, Array]]
@@ -506,17 +512,11 @@ def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
     return all(np.allclose(x[first], y[second], rtol=0, atol=small, equal_nan=True) for x, y in pairs)
 
 
-def _followed_row(followed: Dependence) -> dict[str, object]:
-    names = ["covariate", "unit", "place", "shape", "p_value", "p_beside", "direction", "mean", "sigma"]
-    row = {name: getattr(followed, name) for name in names} | {"at": followed.bins}
-    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in row.items()}
-
-
 def comparison_document(comparison: ResidualTables) -> dict[str, object]:
     """Return compare.json: the tables as plain lists."""
     return {
         "rms": comparison.rms,
-        "follows": [_followed_row(followed) for followed in comparison.followed],
+        "follows": [_FOLLOWED.write(followed) for followed in comparison.followed],
         "means": comparison.means,
         "tables": [_table_row(comparison, table) for table in comparison.tables],
         "views": [

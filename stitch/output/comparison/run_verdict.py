@@ -118,8 +118,7 @@ def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> T
         return check_tolerance(history, tolerance, unit)
     if run.targets is None or run.targets.uninformative:
         return None
-    rows = run.targets.rows
-    reach = float(np.nanquantile(rows.distances(rows.residual), 0.95))
+    reach = float(np.nanquantile(run.targets.distances, 0.95))
     targets = f"95 % of what was seen of the targets lies within {length_text(reach, unit)} of their place"
     sentence = f"{length_text(tolerance, unit, 4)}: {targets} under the model."
     if reach > tolerance:
