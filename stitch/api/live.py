@@ -170,42 +170,37 @@ class LiveSession:
         """
         began = time.perf_counter()
         with self._lock:
-            return self._take(self._read_view(cloud, pose, joints, time_s, covariates, name), began)
+            cell = self.session
+            name = name or f"v{len(cell.views):03d}"
+            if name in cell.names:
+                raise InputError(f"view {name}: there is one of that name; to fix: give it another name")
+            one = Session.from_arrays(
+                {name: cloud},
+                None if pose is None else [pose],
+                mount=cell.mount,
+                joints=None if joints is None else [joints],
+                robot=cell.robot,
+                times=None if time_s is None else [time_s],
+                covariates={key: [value] for key, value in (covariates or {}).items()},
+                scanner=cell.scanner,
+                unit=cast(LengthUnit, cell.length_unit),
+                cloud_unit=self._cloud_unit,
+                name=cell.name,
+                check=False,
+            )
+            return self._take(self._with_axes(replace(one.views[0], approach=None)), began)
 
-    def _read_view(
-        self,
-        cloud: Any,
-        pose: Any,
-        joints: Any,
-        time_s: float | None,
-        covariates: Mapping[str, float] | None,
-        name: str | None,
-    ) -> View:
+    def _with_axes(self, view: View) -> View:
+        """Return a view with the effective pose that its readings of the external axes make of the reported one."""
         cell = self.session
-        name = name or f"v{len(cell.views):03d}"
-        if name in cell.names:
-            raise InputError(f"view {name}: there is one of that name; to fix: give it another name")
-        one = Session.from_arrays(
-            {name: cloud},
-            None if pose is None else [pose],
-            mount=cell.mount,
-            joints=None if joints is None else [joints],
-            robot=cell.robot,
-            times=None if time_s is None else [time_s],
-            covariates={key: [value] for key, value in (covariates or {}).items()},
-            scanner=cell.scanner,
-            unit=cast(LengthUnit, cell.length_unit),
-            cloud_unit=self._cloud_unit,
-            name=cell.name,
-            check=False,
-        )
-        view = replace(one.views[0], approach=None)
         if not cell.axes:
             return view
         for axis in cell.axes:
             if not set(axis.columns(cell.length_unit)) & set(view.covariates):
                 column = " or ".join(axis.columns(cell.length_unit))
-                raise InputError(f"view {name}: no reading of axis {axis.name}; to fix: pass covariates with {column}")
+                raise InputError(
+                    f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with {column}"
+                )
         return place_axes(replace(cell, axes=(), views=(view,)), cell.axes).views[0]
 
     def take(self, view: View) -> LiveView:

@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -18,6 +18,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output.session_files import (
     SessionFiles,
+    TableColumns,
     pose_columns,
     repeatability_table,
     robot_toml,
@@ -38,6 +39,7 @@ from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.session.thinning import MAX_POINTS
 from stitch.system.threads import parallel
+from stitch.system.values import same
 
 LengthUnit = Literal["mm", "m"]
 # Names of views that can be those of files.
@@ -432,11 +434,8 @@ def _files_of(session: SessionData) -> SessionFiles:
     tables, texts = _tables(session)
     nominal = session.nominal
     if nominal is not None:
-        columns = {"target": list(nominal.targets)}
-        columns |= {axis: _digits(values) for axis, values in zip("xyz", nominal.points.T, strict=True)}
-        if np.isfinite(nominal.sigma).any():
-            columns["sigma"] = [_cell(x) for x in nominal.sigma]
-        texts["targets.csv"] = table_text(columns)
+        columns = {"target": nominal.targets, **dict(zip("xyz", nominal.points.T, strict=True))}
+        texts["targets.csv"] = table_text(columns | _known("sigma", nominal.sigma), exact=True)
     return SessionFiles(
         name=session.name,
         length_unit=session.length_unit,
@@ -448,7 +447,7 @@ def _files_of(session: SessionData) -> SessionFiles:
         frames=probes,
         copies=() if session.cad is None else (session.cad,),
         texts=texts,
-        scalar="<f8",
+        exact=True,
     )
 
 
@@ -469,54 +468,50 @@ class _WholeClouds(Mapping[str, Cloud]):
         return len(self.clouds)
 
 
-def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, list[str]]:
-    """Return views.csv with all digits; an empty cell where nothing is known.
+def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, Sequence[object] | Array]:
+    """Return views.csv; an empty cell where nothing is known.
 
     Args:
         files: of the scans; None where no view has one.
     """
     views = session.views
-    columns: dict[str, list[str]] = {"view": session.names}
+    columns: dict[str, Sequence[object] | Array] = {"view": session.names}
     if files is not None:
         columns["cloud"] = [file if view.cloud else "" for file, view in zip(files, views, strict=True)]
     if any(view.time_s is not None for view in views):
-        columns["time_s"] = [_cell(view.time_s) for view in views]
+        columns["time_s"] = [view.time_s for view in views]
     joints = range(next((len(view.joints) for view in views if view.joints is not None), 0))
     for i in joints:
-        columns[f"j{i + 1}_deg"] = [_cell(None if v.joints is None else float(np.degrees(v.joints[i]))) for v in views]
+        columns[f"j{i + 1}_deg"] = [None if v.joints is None else float(np.degrees(v.joints[i])) for v in views]
     if session.has_poses:
-        columns |= {name: _digits(x) for name, x in pose_columns(reported_poses(session)).items()}
+        columns |= pose_columns(reported_poses(session))
     for i in joints:
-        columns[f"j{i + 1}_approach"] = ["" if v.approach is None else f"{v.approach[i]:.0f}" for v in views]
+        columns[f"j{i + 1}_approach"] = [None if v.approach is None else f"{v.approach[i]:.0f}" for v in views]
     for name in dict.fromkeys(name for view in views for name in view.covariates):
-        columns[name] = [_cell(view.covariates.get(name)) for view in views]
+        columns[name] = [view.covariates.get(name) for view in views]
     return columns
 
 
-def _labelled_columns(session: SessionData) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
+def _labelled_columns(session: SessionData) -> tuple[TableColumns | None, TableColumns | None]:
     """Return the columns of points.csv, or of frames.csv where views show a probe."""
     seen = {view.name: view.sighting for view in session.views if view.sighting is not None}
     if not seen:
         return None, None
+    sigma = np.concatenate([sighting.sigma for sighting in seen.values()])
     if all(sighting.rotation is None for sighting in seen.values()):
-        table = [
-            [name, target, *_digits(place), _cell(sigma)]
-            for name, sighting in seen.items()
-            for target, place, sigma in zip(sighting.targets, sighting.points, sighting.sigma, strict=True)
-        ]
-        return _columns(("view", "target", "x", "y", "z", "sigma"), table), None
+        named = [(name, target) for name, sighting in seen.items() for target in sighting.targets]
+        places = np.concatenate([sighting.points for sighting in seen.values()])
+        columns = dict(zip(("view", "target", "x", "y", "z"), (*zip(*named, strict=True), *places.T), strict=True))
+        return columns | _known("sigma", sigma), None
     rotations = [np.eye(3) if sighting.rotation is None else sighting.rotation for sighting in seen.values()]
     T = frames.make(np.array(rotations), np.array([sighting.points[0] for sighting in seen.values()]))
-    columns = {"view": list(seen), **{key: _digits(x) for key, x in pose_columns(T).items()}}
-    columns["sigma"] = [_cell(sighting.sigma[0]) for sighting in seen.values()]
-    columns["sigma_deg"] = [_cell(float(np.degrees(sighting.sigma_rotation))) for sighting in seen.values()]
-    return None, columns
+    turns = np.degrees([sighting.sigma_rotation for sighting in seen.values()])
+    return None, {"view": list(seen), **pose_columns(T), "sigma": sigma, "sigma_deg": turns}
 
 
-def _columns(names: Sequence[str], rows: list[list[str]]) -> dict[str, list[str]]:
-    """Return the columns of a table; one in which nothing stands is left out."""
-    columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
-    return {name: column for name, column in columns.items() if any(column)}
+def _known(name: str, values: Array) -> dict[str, Array]:
+    """Return a column; none where nobody knows any of its numbers."""
+    return {name: values} if np.isfinite(values).any() else {}
 
 
 def _tables(session: SessionData) -> tuple[dict[str, Any], dict[str, str]]:
@@ -557,40 +552,11 @@ def _require_same(session: SessionData, folder: Path) -> None:
         raise InputError(f"it would not be read back: {text}") from None
     if read.names != session.names:
         raise InputError(f"{session.name}: names of its views cannot be written; to fix: give them plain names")
+    held = {"pose": "T_base_flange", "joints": "joints", "time": "time_s", "covariates": "covariates"}
+    held["labelled points"] = "sighting"
     for view, there in zip(session.views, read.views, strict=True):
-        odd = next((what for what, same in _sameness(view, there) if not same), None)
+        lost = (what for what, name in held.items() if not same(getattr(view, name), getattr(there, name), _ROUNDED))
+        scans = [None if v.cloud is None else v.cloud.count for v in (view, there)]
+        odd = next(lost, None if scans[0] == scans[1] else "scan")
         if odd is not None:
-            raise InputError(f"{session.name}: {odd} of view {view.name} cannot be written; to fix: correct them")
-
-
-def _sameness(view: View, there: View) -> Iterator[tuple[str, bool]]:
-    """Yield what a view holds, and whether it is the same there."""
-    close = partial(np.allclose, rtol=_ROUNDED, atol=_ROUNDED)
-    yield "the pose", close(view.T_base_flange, there.T_base_flange)
-    yield "the joints", _both(view.joints, there.joints, close)
-    yield "the time", view.time_s == there.time_s
-    yield "the covariates", view.covariates == there.covariates
-    yield "the scan", _both(view.cloud, there.cloud, lambda a, b: a.count == b.count)
-    yield (
-        "the labelled points",
-        _both(
-            view.sighting,
-            there.sighting,
-            lambda a, b: (
-                a.targets == b.targets and close(a.points, b.points) and close(a.sigma, b.sigma, equal_nan=True)
-            ),
-        ),
-    )
-
-
-def _both(one: Any, other: Any, same: Callable[[Any, Any], bool]) -> bool:
-    return one is other if one is None or other is None else same(one, other)
-
-
-def _digits(values: Array) -> list[str]:
-    """Return numbers that read back as they are."""
-    return [repr(float(x)) for x in values]
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None or not np.isfinite(value) else repr(float(value))
+            raise InputError(f"{session.name}: the {odd} of view {view.name} cannot be written; to fix: correct them")

@@ -278,7 +278,7 @@ def objection_in_halves(scored: Score) -> str | None:
         return None
     sizes = scored.form.sizes
     gains, p_values, shares = [], [], []
-    ways = halves_of(base.observation.T_base_flange, base.observation.reach)
+    ways = halves_of(base.observation.capture.T_base_flange, base.observation.reach)
     for way in ways:
         explained = [base.explained_without(other) for other in reversed(way)]
         gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (explained, explained[::-1])))

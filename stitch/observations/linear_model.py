@@ -36,6 +36,7 @@ from stitch.numerics.reml import (
 )
 from stitch.numerics.variance_posterior import Satterthwaite, satterthwaite
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
+from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
 # The first components of whatever was observed, by their names; what poses err beside follows them.
@@ -56,7 +57,6 @@ class PointSums(Protocol):
 
     def select(self, keep: slice | Mask) -> "PointSums":
         """The sums of some of the parameters."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -80,23 +80,18 @@ class LinearTrial(Protocol):
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """(k,) coefficients by least squares, without some views."""
-        ...
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
         """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
-        ...
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
-        ...
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Sum of squares by which left-out views lie off, in units of their scatter."""
-        ...
 
     def influential_views(self, coefficients: Array) -> Indices:
         """(n,) views of which one alone could carry the coefficients (k,)."""
-        ...
 
 
 class Observation(ABC):
@@ -105,12 +100,8 @@ class Observation(ABC):
     One whose responses count something else overrides `reduce` and `expand`; what its views share, `numbers_per_view`.
     """
 
+    capture: Capture  # of the views, in the order of time, without the effects in use
     centre: Array  # (3,) about which twists of the views count, reference frame
-
-    @property
-    @abstractmethod
-    def T_base_flange(self) -> Array:
-        """(V, 4, 4) of the views, in the order of time."""
 
     @property
     @abstractmethod
@@ -149,7 +140,7 @@ class Observation(ABC):
     @cached_property
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
-        return grouped_folds(self.T_base_flange, self.reach)
+        return grouped_folds(self.capture.T_base_flange, self.reach)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
         """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""

@@ -69,11 +69,6 @@ class Rows(Observation):
         return np.concatenate([of_views, np.zeros((len(self.residual) - len(of_views), *of_views.shape[1:]))])
 
     @property
-    def T_base_flange(self) -> Array:
-        """(V, 4, 4) of the views, in the order of time."""
-        return self.capture.T_base_flange
-
-    @property
     def reach(self) -> float:
         """Distance of what is seen from the flange: what a turn of it moves the points by."""
         away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)

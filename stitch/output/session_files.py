@@ -5,6 +5,7 @@ The one writer of the format: the cells hand out their readings with it, and sim
 
 import csv
 import io
+import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -41,7 +42,7 @@ class SessionFiles:
     targets: Mapping[str, Array] = field(default_factory=dict)  # nominal places (3,), part frame
     copies: Sequence[Path] = ()  # files that lie beside session.toml, such as the part's CAD
     texts: Mapping[str, str] = field(default_factory=dict)  # by file: others that lie there, such as a URDF
-    scalar: str = "<f4"  # in which type clouds hold their scalars; "<f8" keeps every digit
+    exact: bool = False  # every digit of tables, and of the scalars of clouds
 
 
 def pose_columns(T: Array) -> dict[str, Array]:
@@ -111,11 +112,10 @@ def _write(folder: Path, session: SessionFiles) -> None:
         shutil.copyfile(file, folder / file.name)
     for name, cloud in session.clouds.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_ply(folder / name, cloud, session.scalar)
-    write_table(folder / "views.csv", session.views)
-    for name, table in (("points.csv", session.points), ("frames.csv", session.frames)):
+        write_ply(folder / name, cloud, "<f8" if session.exact else "<f4")
+    for name, table in (("views.csv", session.views), ("points.csv", session.points), ("frames.csv", session.frames)):
         if table is not None:
-            write_table(folder / name, table)
+            write_table(folder / name, table, session.exact)
     if session.targets:
         xyz = np.array(list(session.targets.values()))
         write_table(folder / "targets.csv", {"target": list(session.targets), **dict(zip("xyz", xyz.T, strict=True))})
@@ -134,18 +134,27 @@ def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
     ply_file.write_ply(path, {"vertex": vertex})
 
 
-def write_table(file: Path, columns: TableColumns) -> None:
+def write_table(file: Path, columns: TableColumns, exact: bool = False) -> None:
     """Write one table of a session."""
-    file.write_text(table_text(columns), encoding="utf-8", newline="")
+    file.write_text(table_text(columns, exact), encoding="utf-8", newline="")
 
 
-def table_text(columns: TableColumns) -> str:
-    """Return a table as CSV."""
+def table_text(columns: TableColumns, exact: bool = False) -> str:
+    """Return a table as CSV.
+
+    Args:
+        exact: numbers read back as they are, and one that is not known is an empty cell.
+    """
+
+    def cell(value: object) -> object:
+        if not isinstance(value, float):
+            return value
+        return f"{value:.12g}" if not exact else repr(float(value)) if math.isfinite(value) else ""
+
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([f"{value:.12g}" if isinstance(value, float) else value for value in row])
+    writer.writerows(map(cell, row) for row in zip(*columns.values(), strict=True))
     return out.getvalue()
 
 

@@ -100,29 +100,37 @@ def take_rows(item: Item, index: Any, *names: str) -> Item:
     return replace(item, **{name: rows(getattr(item, name)) for name in names})  # type: ignore[type-var]
 
 
-def same(a: Any, b: Any) -> bool:
-    """Return whether two values hold the same; NaN equals NaN, and arrays are equal where their numbers are."""
+def same(a: Any, b: Any, within: float = 0.0) -> bool:
+    """Return whether two values hold the same; NaN equals NaN, and arrays are equal where their numbers are.
+
+    Args:
+        within: by which numbers may differ, and by which share of themselves.
+    """
     if a is b:
         return True
     if isinstance(a, Value) or isinstance(b, Value):
         return bool(a == b)
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return np.shape(a) == np.shape(b) and np.asarray(a).dtype == np.asarray(b).dtype and _equal_arrays(a, b)
+        if np.shape(a) != np.shape(b) or np.asarray(a).dtype != np.asarray(b).dtype:
+            return False
+        if np.asarray(a).dtype.kind not in "fcmM":
+            return bool(np.array_equal(a, b))
+        return bool(
+            np.allclose(a, b, within, within, equal_nan=True) if within else np.array_equal(a, b, equal_nan=True)
+        )
     if type(a) is not type(b):
         return False
     if isinstance(a, Mapping):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+        return a.keys() == b.keys() and all(same(a[key], b[key], within) for key in a)
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
+        return len(a) == len(b) and all(same(x, y, within) for x, y in zip(a, b, strict=True))
     if isinstance(a, partial):
         return same((a.func, a.args, a.keywords), (b.func, b.args, b.keywords))
     if is_dataclass(a):
-        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.compare)
+        return all(same(getattr(a, f.name), getattr(b, f.name), within) for f in fields(a) if f.compare)
+    if within and isinstance(a, float):
+        return bool(np.isclose(a, b, within, within, equal_nan=True))
     return bool(a == b) or (a != a and b != b)
-
-
-def _equal_arrays(a: Any, b: Any) -> bool:
-    return bool(np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind in "fcmM"))
 
 
 def plain(value: Any) -> Any:

@@ -120,11 +120,6 @@ class SurfaceObservation(Observation):
     centre: Array  # (3,) of the overlaps, reference frame
 
     @property
-    def T_base_flange(self) -> Array:
-        """(V, 4, 4) of the views, in the order of time."""
-        return self.capture.T_base_flange
-
-    @property
     def reach(self) -> float:
         """Rms lever of the correspondences about the centre."""
         return self.unconstrained.overlaps.gram.lever

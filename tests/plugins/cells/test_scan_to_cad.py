@@ -276,7 +276,7 @@ def sweeps(folder, columns=("sweep_x", "sweep_y", "sweep_z"), time=True):
         places.append(place)
     views = {"view": ["v0", "v1"], "cloud": list(clouds), **pose_columns(poses)}
     views |= dict(zip(columns, velocity.T, strict=True))
-    write_session(folder / "s", SessionFiles("s", "mm", "eye_in_hand", views, clouds=clouds, scalar="<f8"))
+    write_session(folder / "s", SessionFiles("s", "mm", "eye_in_hand", views, clouds=clouds, exact=True))
     (folder / "x.json").write_text(json.dumps({"hand_eye": T_flange_scanner.tolist(), "length_unit": "mm"}))
     return read_placed_session(folder / "s", folder / "x.json"), velocity, places
 
