@@ -65,7 +65,8 @@ def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
             scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
         try:
             yield scratch
-            scratch.chmod(0o777 & ~_umask())
+            os.umask(umask := os.umask(0))
+            scratch.chmod(0o777 & ~umask)
             sync_to_disk(scratch)
             _commit(scratch, path, ours)
         except OSError as error:
@@ -272,9 +273,3 @@ def sync_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

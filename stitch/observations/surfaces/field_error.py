@@ -26,7 +26,6 @@ from stitch.observations.surfaces.scanner_errors import (
     COARSE,
     FINE,
     PER_VIEW,
-    SHARE_BOUNDS,
     SHARED,
     SmoothErrorLikelihood,
     half_field,
@@ -152,10 +151,10 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
         # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         return 0.5 * chi2_tail(2 * gain, 1) < alpha
 
-    shares, free = likelihood.ml_shares(_share_limits(likelihood, {}))
+    shares, free = likelihood.ml_shares()
 
     def nats(share: float) -> float:
-        return 0.5 * (likelihood.ml_shares(_share_limits(likelihood, {cause: share}))[1] - free)
+        return 0.5 * (likelihood.ml_shares({cause: share})[1] - free)
 
     gain = nats(ALARM_SHARE)
     if not clear(gain):
@@ -166,15 +165,8 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
 def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
     """Return the nats that errors of all views gain over usual ones where those of single views are usual."""
     usual = {PER_VIEW: ALARM_SHARE}
-    deviances = [
-        likelihood.ml_shares(_share_limits(likelihood, limits))[1] for limits in (usual | {SHARED: ALARM_SHARE}, usual)
-    ]
-    return 0.5 * (deviances[0] - deviances[1])
-
-
-def _share_limits(likelihood: SmoothErrorLikelihood, limits: dict[int, float]) -> list[float]:
-    """Return the largest share of each cause."""
-    return [limits.get(cause, SHARE_BOUNDS[1]) for cause in range(len(likelihood.design))]
+    both_usual = usual | {SHARED: ALARM_SHARE}
+    return 0.5 * (likelihood.ml_shares(both_usual)[1] - likelihood.ml_shares(usual)[1])
 
 
 def _follows_time(errors: Array, alpha: float) -> bool:
@@ -200,7 +192,7 @@ def field_map(
     """
     likelihood = _coarse_fine_likelihood(sums, unconstrained, noise, nuisance)
     # Coarse and finer errors as one cause of unit size beside incidence.
-    shares = likelihood.ml_shares([SHARE_BOUNDS[1]] * len(likelihood.design))[0]
+    shares = likelihood.ml_shares()[0]
     coarse, fine, incidence = (share * columns for share, columns in zip(shares, likelihood.design, strict=True))
     sizes = np.repeat(shares[:2], [coarse.shape[1], fine.shape[1]])
     likelihood = replace(likelihood, design=(np.hstack([coarse, fine]), incidence))

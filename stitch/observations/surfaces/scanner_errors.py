@@ -10,7 +10,7 @@ arm still moves. Each scan is sound then, and no motion of the views makes them 
 has: `field_error.py`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -244,9 +244,14 @@ class SmoothErrorLikelihood:
         values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
         return np.sqrt((vectors**2) @ (1 / np.maximum(values, SHARE_SPREAD**-2.0)))
 
-    def ml_shares(self, most: Sequence[float]) -> tuple[Array, float]:
-        """Return shares (C,) without a prior, at most so large, and −2 log likelihood."""
-        bounds = [(np.log(SHARE_BOUNDS[0]), np.log(size)) for size in most]
+    def ml_shares(self, limits: Mapping[int, float] | None = None) -> tuple[Array, float]:
+        """Return shares (C,) without a prior, and −2 log likelihood.
+
+        Args:
+            limits: the largest share of some causes.
+        """
+        largest_shares = dict.fromkeys(range(len(self.design)), SHARE_BOUNDS[1]) | dict(limits or {})
+        bounds = [(np.log(SHARE_BOUNDS[0]), np.log(size)) for size in largest_shares.values()]
         # The likelihood is flat where errors are small: from the largest on, and from usual ones.
         largest = np.array([b for _, b in bounds])
         starts = [largest, np.minimum(largest, np.log(USUAL_SHARE))]

@@ -129,9 +129,8 @@ class _PointEquations:
                 weight = _weights(rest)
             R = vec.reshape(3, 3)
             ends.append(R * np.sign(np.linalg.det(R)) if on_sphere else R)
-        return [frames.nearest_rotation(R) for R in ends if _is_near_rotation(R)] or [
-            frames.nearest_rotation(R) for R in ends
-        ]
+        near = [R for R in ends if np.abs(np.linalg.svd(R, compute_uv=False) - 1).max() < _NO_ROTATION]
+        return [frames.nearest_rotation(R) for R in near or ends]
 
     def improved(self, R: Array) -> tuple[Array, float]:
         """Return T_mount_sensor (4, 4) from a rotation to begin with, and the sum of distances that it leaves."""
@@ -162,10 +161,6 @@ class _PointEquations:
         flat = rows.reshape(len(rows), -1)
         means = (self.of_target @ (weight[:, None] * flat)) / np.maximum(self.of_target @ weight, 1e-300)[:, None]
         return (flat - means[self.target]).reshape(rows.shape)
-
-
-def _is_near_rotation(R: Array) -> bool:
-    return bool(np.abs(np.linalg.svd(R, compute_uv=False) - 1).max() < _NO_ROTATION)
 
 
 def _weights(left: Array) -> Array:

@@ -20,6 +20,7 @@ from stitch.run_data import RunData
 from stitch.system.open3d_library import import_open3d
 
 _FORMAT = "stitch-witness/1"
+_PACKAGES = ("open3d", "open3d-cpu")
 # Points of a view that are registered: a surface is averaged over enough of them, and a pair takes a tenth of a second.
 _POINTS = 30_000
 # Distances between partners, coarse to fine, and the scale beyond which the last, robust fit doubts; in spacings of the
@@ -132,16 +133,16 @@ def open3d_witness(run: RunData) -> Witness:
     with _one_thread(o3d):
         poses, pairs = _registered(o3d, clouds, run.poses_model, spacing)
         normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
-    poses = _common_motion(clouds, poses, run.poses) @ poses
+    poses = align_points(_placed(clouds, poses), _placed(clouds, run.poses)) @ poses
     difference = frames.inverse(run.poses) @ poses
     middles = np.array([points.mean(axis=0) for points in clouds])
     moved = np.array([frames.transform(T, m[None])[0] - m for T, m in zip(difference, middles, strict=True)])
-    placed = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
+    placed = _placed(clouds, poses)
     placed_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
     fused, fused_normals = run.fused.points, run.fused.normals
     asked = fused[:: max(1, len(fused) // _ASKED)]
     return Witness(
-        version=_version(),
+        version=next(d.version for d in distributions() if (d.metadata["Name"] or "").lower() in _PACKAGES),
         views=tuple(run.session.names),
         poses=poses,
         shift=np.linalg.norm(moved, axis=1),
@@ -152,10 +153,6 @@ def open3d_witness(run: RunData) -> Witness:
         places=asked,
         overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * spacing),
     )
-
-
-def _version() -> str:
-    return next(d.version for d in distributions() if (d.metadata["Name"] or "").lower() in ("open3d", "open3d-cpu"))
 
 
 @contextmanager
@@ -229,11 +226,9 @@ def _one_sided(clouds: list[Array], poses: Array) -> list[tuple[int, int]]:
     return [(i, j) for i, j in combinations(range(len(clouds)), 2) if unit[i] @ unit[j] > _SAME_SIDE]
 
 
-def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
-    """Return the rigid motion (4, 4) that brings all views nearest to where others put them."""
-    a = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
-    b = np.concatenate([frames.transform(T, points) for T, points in zip(wanted, clouds, strict=True)])
-    return align_points(a, b)
+def _placed(clouds: list[Array], poses: Array) -> Array:
+    """Return the points (N, 3) of all clouds under poses (V, 4, 4), one cloud after the other."""
+    return np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
 
 
 def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Array], reach: float) -> Array:

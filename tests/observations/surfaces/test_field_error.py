@@ -213,7 +213,7 @@ def test_sizes_are_those_with_which_errors_were_drawn():
     for _ in range(40):
         errors = sum(s * t @ rng.standard_normal(t.shape[1]) for s, t in zip(true, told, strict=True))
         seen = errors + 0.5 * rng.standard_normal(150)
-        found.append(np.log(SmoothErrorLikelihood(seen, told, np.full(150, 0.25)).ml_shares([10.0] * 3)[0] / true))
+        found.append(np.log(SmoothErrorLikelihood(seen, told, np.full(150, 0.25)).ml_shares()[0] / true))
     # Likelihood underestimates variances of n numbers by about 1/n of themselves.
     mean, error = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(len(found))
     assert np.all(np.abs(mean) < 3 * error + 1 / np.array([20, 20, 90]))
