@@ -106,23 +106,24 @@ def _heights(places: Array, points: Array, normals: Array, tree: Any, size: floa
     """Return the signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
 
     # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take longer.
-    columns, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)
+    point_columns = np.ascontiguousarray(points.T)
+    normal_columns = np.ascontiguousarray(normals.T)
 
-    def of(block: Array) -> tuple[Array, Array]:
+    def heights_of(block: Array) -> tuple[Array, Array]:
         distance, index = (np.ascontiguousarray(x.T) for x in tree.query(block, k=_NEIGHBOURS))
-        n = np.array([column.take(index) for column in facing])
-        away = np.array([at - column.take(index) for column, at in zip(columns, block.T, strict=True)])
+        facing = np.array([column.take(index) for column in normal_columns])
+        away = np.array([at - column.take(index) for column, at in zip(point_columns, block.T, strict=True)])
         # Of a thin sheet only the nearer side counts.
-        agree = np.maximum(np.einsum("ikp,ip->kp", n, n[:, 0]), 0)
+        agree = np.maximum(np.einsum("ikp,ip->kp", facing, facing[:, 0]), 0)
         weight = agree * np.exp((distance[0] ** 2 - distance**2) / size**2)
         weight /= weight.sum(axis=0)
-        here = np.einsum("kp,ikp->ip", weight, n)
+        here = np.einsum("kp,ikp->ip", weight, facing)
         here /= np.sqrt(np.einsum("ip,ip->p", here, here))
         # Tangent planes at the points lie above a convex surface, one at the place itself below it: on a ball the
         # mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
-        n += here[:, None]
-        return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", n, away)) / 2, distance[0]
+        facing += here[:, None]
+        return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", facing, away)) / 2, distance[0]
 
-    blocks = parallel(of, np.array_split(places, len(places) // _IN_CACHE + 1), "blocks of the mesh")
+    blocks = parallel(heights_of, np.array_split(places, len(places) // _IN_CACHE + 1), "blocks of the mesh")
     heights, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return heights, nearest

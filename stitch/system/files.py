@@ -65,7 +65,8 @@ def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
             scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
         try:
             yield scratch
-            os.umask(umask := os.umask(0))
+            umask = os.umask(0)  # which is told only in exchange for another
+            os.umask(umask)
             scratch.chmod(0o777 & ~umask)
             sync_to_disk(scratch)
             _commit(scratch, path, ours)

@@ -340,19 +340,16 @@ def solve_hand_eye(
     rig = RigModel(parts)
     scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns, e.common_columns) for e in parts)
     prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
-    # Twists of the hand-eye, one sigma of the prior each, across those that the motions show.
-    sigma = np.diag(prior)[:6] ** -0.5
-    visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
-    hidden = sigma[:, None] * null_space(visible.T, rcond=1e-9)
-    held = prior.copy()
-    held[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
+    hidden = _hidden_twists(captures, T_mount, prior)
+    # What the motions do not show stays where it is.
+    prior[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
     prior_vector = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
-    gls = rig.fit_gls(scatter, held)
+    gls = rig.fit_gls(scatter, prior)
     x = gls.solve(rig.z, prior_vector)
     return HandEyeSolution(
         rig=rig,
         scatter=scatter,
-        prior=held,
+        prior=prior,
         prior_vector=prior_vector,
         gls=gls,
         x=x,
@@ -360,6 +357,13 @@ def solve_hand_eye(
         hidden=hidden,
         T_mount=T_mount @ frames.exp(x[:6]),
     )
+
+
+def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) -> Array:
+    """Return twists (6, m) of the hand-eye that the motions do not show, one sigma of the prior each."""
+    sigma = np.diag(prior)[:6] ** -0.5
+    visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
+    return sigma[:, None] * null_space(visible.T, rcond=1e-9)
 
 
 def step_hand_eye(

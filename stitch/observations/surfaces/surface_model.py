@@ -183,34 +183,33 @@ def surface_model(
         variances: of scatter, noise and further errors of these names, of views that nobody has taken; None: as the
             views tell.
     """
-    g, frames_of_mount = unconstrained.overlaps.gram, capture.hand_eye_frames(model.T_mount)
-    reduced = reduce_poses(g, unconstrained.twists, frames_of_mount, capture)
+    gram = unconstrained.overlaps.gram
+    frames_of_mount = capture.hand_eye_frames(model.T_mount)
+    reduced = reduce_poses(gram, unconstrained.twists, frames_of_mount, capture)
 
     def fit_null(mixed: MixedModel, names: Sequence[str] = ()) -> VarianceFit:
         return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))
 
+    # Which effects in use the views show at all, under scatter, noise and the scanner's own errors.
     twists = view_columns(measurement, model, unconstrained)
     sizes, values = sizes_of(model.terms), values_of(model.terms)
-    known = [field_scatter(measurement, unconstrained)]
-    if measurement.views.scanners:
-        # What one scanner's millimetre differs by from another's shows, and every pair has it.
-        known.append(scale_scatter(measurement, unconstrained))
-    field = reduced.reduction @ np.hstack(known)
-    alone = replace(hand_eye_mixed_model(reduced), fixed=(field @ field.T)[None])
-    half = np.linalg.cholesky(alone.covariance(fit_null(alone).variances)[0])
-    base = np.linalg.solve(half, reduced.hand_eye).astype(float)
-    further = np.linalg.solve(half, reduced.reduction @ twists).astype(float)
-    seen = independent(base, further, sizes, _UNSEEN)
-    mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=alone.fixed)
+    hand_eye_alone = replace(
+        hand_eye_mixed_model(reduced), fixed=_scanner_covariance(measurement, unconstrained, reduced)
+    )
+    half = np.linalg.cholesky(hand_eye_alone.covariance(fit_null(hand_eye_alone).variances)[0])
+    white_hand_eye = np.linalg.solve(half, reduced.hand_eye).astype(float)
+    white_effects = np.linalg.solve(half, reduced.reduction @ twists).astype(float)
+    seen = independent(white_hand_eye, white_effects, sizes, _UNSEEN)
+    mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=hand_eye_alone.fixed)
     errors = None
     if measurement.views.count < MANY_VIEWS:
-        errors = prior_pose_errors([measurement], model, [g.centre]).project(reduced.reduction)
+        errors = prior_pose_errors([measurement], model, [gram.centre]).project(reduced.reduction)
         mixed = with_pose_errors(mixed, errors)
     return LinearModel(
         measurement,
         model,
-        SurfaceObservation(capture, unconstrained, reduced, g.centre),
-        design=np.hstack([hand_eye_jacobian(frames_of_mount, g.centre), twists[:, seen]]),
+        SurfaceObservation(capture, unconstrained, reduced, gram.centre),
+        design=np.hstack([hand_eye_jacobian(frames_of_mount, gram.centre), twists[:, seen]]),
         sizes=np.append(np.full(6, np.inf), sizes[seen]),
         values=np.append(np.zeros(6), values[seen]),
         mixed=mixed,
@@ -218,3 +217,13 @@ def surface_model(
         pose_errors=errors,
         flange_per_joint=np.zeros(2) if errors is None else errors.flange_per_joint,
     )
+
+
+def _scanner_covariance(measurement: Measurement, unconstrained: UnconstrainedPoses, reduced: ReducedPoses) -> Array:
+    """Return the covariance (1, n, n) of the visible directions by what every scanner errs by."""
+    errors = [field_scatter(measurement, unconstrained)]
+    if measurement.views.scanners:
+        # What one scanner's millimetre differs by from another's shows, and every pair has it.
+        errors.append(scale_scatter(measurement, unconstrained))
+    columns = reduced.reduction @ np.hstack(errors)
+    return (columns @ columns.T)[None]
