@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import escape
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
 from stitch.diagnosis.sentences import fitted_amounts
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
@@ -133,10 +134,11 @@ def _next(found: Diagnosis, run: str) -> str:
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
     typed = f"<p>{_words(said)}:</p>{_typed(command)}"
     poses = [proposal for proposal in found.next if proposal.probability is not None]
-    if found.verdict == "cannot_tell" and poses:
-        decides = _words(f"The view that decides, with a probability of {poses[0].probability:.0%}: {poses[0].do}.")
+    if found.verdict in ("cannot_tell", "unknown_effect") and poses:
+        odds = f"with a probability of {poses[0].probability:.0%}: {poses[0].do}. {NOT_IN_ODDS}"
+        decides = _words(f"The view that decides {deciding_words(found)}, {odds}")
         instead = "" if command.startswith("stitch next") else f"<p>{_words('No time? ' + said)}:</p>{_typed(command)}"
-        scan = "<p>Scan there, add scan and row to the session, and run it again: the one law is then named.</p>"
+        scan = "<p>Scan there, add scan and row to the session, and run it again.</p>"
         typed = f"<p>{decides}</p>{_typed(f'stitch next {shlex.quote(run)} -o next.src')}{scan}{instead}"
     return f'<div class="card next"><h2>Next</h2>{typed}{after}</div>'
 

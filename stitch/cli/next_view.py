@@ -83,6 +83,7 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
 
     import numpy as np
 
+    from stitch.diagnosis.next_view import deciding_words
     from stitch.numerics.units import METRES
     from stitch.system.files import whole_file
 
@@ -94,8 +95,9 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
         raise InputError(f"{output}: programs are written by stitch's export plug-in; to fix: install stitch anew")
     T_base_flange = np.array([proposal.T_base_flange for proposal in poses])
     T_base_flange[:, :3, 3] *= METRES[diagnosis.linear.measurement.length_unit] * 1e3
-    separates = poses[0].separates
-    about = f"Drives to the view that decides between {' and '.join(separates)}." if separates else "Drives to a view."
+    about = (
+        f"Drives to the view that decides {deciding_words(diagnosis)}." if poses[0].separates else "Drives to a view."
+    )
     waits = [f"{proposal.wait_s / 60:.0f} min" for proposal in poses if proposal.wait_s]
     about += f" Scan no sooner after the last view than: {', '.join(waits)}." if waits else ""
     text = writer.load()(output, [proposal.joints_deg for proposal in poses], T_base_flange, about, j3)
@@ -112,21 +114,22 @@ def show_next_views(diagnosis: Diagnosis, document: dict[str, Any]) -> None:
     """Print the views that decide, their odds, what each rival expects in the first, and artefacts."""
     poses = proposed_poses(diagnosis)
     if poses and poses[0].separates:
-        _show_deciding(poses, document)
+        _show_deciding(diagnosis, poses, document)
     for proposal in diagnosis.next:
         if proposal not in poses or not proposal.separates:
-            what = f"To separate {' from '.join(proposal.separates)}" if proposal.separates else "To see more of it"
+            what = f"To separate {' from '.join(proposal.separates)}" if proposal.separates[1:] else "To see more of it"
             say(f"{what}: {proposal.do}.")
     if not diagnosis.next:
         say(_why_nothing(diagnosis))
 
 
-def _show_deciding(poses: list[Proposal], document: dict[str, Any]) -> None:
+def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[str, Any]) -> None:
+    from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
     from stitch.numerics.units import angle_text, length_text
 
-    rivals = " and ".join(poses[0].separates)
     number = "One further view decides" if len(poses) == 1 else f"{len(poses)} further views decide"
-    say(f"{number} between {rivals} with a probability of {poses[-1].probability:.0%}.", bold=True)
+    say(f"{number} {deciding_words(diagnosis)} with a probability of {poses[-1].probability:.0%}.", bold=True)
+    say(NOT_IN_ODDS)
     columns = (
         ("joints °", lambda p: " ".join(f"{x:.0f}" for x in p.joints_deg)),
         ("wait", lambda p: f"{p.wait_s / 60:.0f} min" if p.wait_s else "–"),

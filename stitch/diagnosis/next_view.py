@@ -26,6 +26,8 @@ from stitch.system.threads import library_threads_off
 _TRIED, _LIKELIEST = 250, 6
 # Nats behind the best within which others count beside the rivals, and how many of them.
 _NEAR, _OTHERS = 10.0, 3
+# What the odds of a view are without.
+NOT_IN_ODDS = "The odds do not hold what views left out may say against it."
 # Precision of ten plausible sizes: a rival may take each of its parameters that large.
 RIDGE = 0.01
 
@@ -152,6 +154,14 @@ def least_known_view(diagnosis: Diagnosis) -> Proposal | None:
     k = int(far.argmax())
     where = f"no view has joint {joint + 1} within {far[k]:.0f}° of there, and how it errs is known least"
     return _pose(linear, f"take a view near {angles_text(possible[k])}: {where}", (), possible[k])
+
+
+def deciding_words(diagnosis: Diagnosis) -> str:
+    """Return what the proposed view decides: "between gear_eccentricity and gear_harmonic"."""
+    rivals = next((proposal.separates for proposal in diagnosis.next if proposal.probability is not None), ())
+    if diagnosis.verdict == "unknown_effect":
+        return f"whether it is {', '.join(rivals)} or a joint without a law"
+    return f"between {' and '.join(rivals)}"
 
 
 def angles_text(joints: Array) -> str:

@@ -236,7 +236,7 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
                 follows = f": the error follows joint {diagnosis.curves[0].joint}"
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
-            return f"Something is missing that no known effect explains{follows}."
+            return f"Something is missing that no known effect explains{follows}.{_decided_by(diagnosis)}"
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
     if len(named) > 1:
         return _rivals(named, trends) + _decided_by(diagnosis)
@@ -346,7 +346,8 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) ->
 def _decided_by(diagnosis: Diagnosis) -> str:
     """Return how likely the next view decides, as a sentence; empty where no pose does."""
     first = next((proposal.probability for proposal in diagnosis.next if proposal.probability is not None), None)
-    return "" if first is None else f" One more view decides ({first:.0%})."
+    does = "may tell whether one does" if diagnosis.verdict == "unknown_effect" else "decides"
+    return "" if first is None else f" One more view {does} ({first:.0%})."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
