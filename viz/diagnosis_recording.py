@@ -64,8 +64,9 @@ def log_diagnosis(
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
     told = [] if screen is None else screen["candidates"]
     on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in told if c["mean"] is not None}
-    plain = plain_finding(found, length_unit)
-    rec.log("diagnosis/plain", words(plain), static=True)
+    plain = plain_finding(found, length_unit) if screen is None else screen["headline"]
+    proof = [] if screen is None else [screen["proof"], f"How sure: {screen['certainty']}"]
+    rec.log("diagnosis/plain", words("\n\n".join([f"**{plain}**", *proof])), static=True)
     courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]
     lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{suggested_command(found, 'RUN')}", ""]
     lines += [
