@@ -20,7 +20,7 @@ from data_synth.ordinary_arm import OrdinaryArm, draw_arm
 from stitch import NoResultError
 from stitch.api.pipeline import run
 from stitch.api.stepwise import suggest
-from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.candidates import Candidate, Form, candidates_of
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
@@ -45,6 +45,7 @@ _ORDINARY = ("joint_offset", "link_geometry", "gear_eccentricity")
 _SWEPT = {"one joint": 1, "two joints": 2, "all joints": 6}
 _ARM_SIZES = (0.0, 0.3, 1.0)
 _STEPS, _AT_SWEEP = 6, 2.0  # views up and back again, and multiples of the detectable size
+_SLIPS_AT = 48  # view of 144
 HIDDEN = ("joint_offset", "link_geometry", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash")
 HIDDEN += ("settling", "part_slip")
 # Three sessions of one arm: kg at its flange, where they hang, and what joint 2 or 3 errs by, rad/(N m) and rad.
@@ -120,7 +121,7 @@ def swept_session(
     robot = robot_from_dh("arm", "standard", table, payload, np.array([0, 0, -9.81]), "mm")
     slip = np.zeros((views, 6))
     if name == "part_slip":
-        slip[views // 3 :, ("rx", "ry", "rz", "tx", "ty", "tz").index(parameter)] = value
+        slip[_SLIPS_AT:, ("rx", "ry", "rz", "tx", "ty", "tz").index(parameter)] = value
     seen = []
     for v in range(views):
         points = frames.transform(frames.inverse(X) @ T[v] @ frames.exp(slip[v]), _PLACES)
@@ -163,20 +164,28 @@ def sweep_trial(job: Row) -> Row:
 def _at_twice_detectable(clean: SessionData, name: str, rng: np.random.Generator) -> tuple[str, str, float]:
     """Return an effect, one of its parameters that the sweep shows, and twice its detectable size.
 
-    It shows what no other effect imitates by more than nine tenths, those aside that begin at some view.
+    It shows what no other effect imitates by more than nine tenths: a jump, also by jumps at that view.
     """
     linear = linear_model_of(run(clean))
     candidates = candidates_of(linear)[0]
     candidate = next(c for c in candidates if c.name == name)
     sizes = detectable_sizes(linear, candidate, sum(not c.empirical for c in candidates))
-    others = [c.forms[0] for c in candidates if c.name != name and not c.forms[0].term.gridded.any()]
-    whites = [linear.residual(form.columns) * form.sizes for form in others]
+    form, jumps = _beginning(candidate), candidate.forms[0].term.gridded.any()
+    others = [_beginning(c) for c in candidates if c.name != name and (jumps or not c.forms[0].term.gridded.any())]
+    whites = [linear.residual(other.columns) * other.sizes for other in others]
     shown = []
-    for p, column in zip(candidate.forms[0].free, linear.residual(candidate.forms[0].columns).T, strict=True):
+    for p, column in zip(form.free, linear.residual(form.columns).T, strict=True):
         if _AT_SWEEP * sizes[p.name] < p.limit and max(imitated_share(column, X) for X in whites) < ALIAS_CORRELATION:
             shown.append(p.name)
     chosen = shown[int(rng.integers(len(shown)))]
     return name, chosen, float(_AT_SWEEP * sizes[chosen] * rng.choice([-1, 1]))
+
+
+def _beginning(candidate: Candidate) -> Form:
+    """Return the form that begins where part_slip does here, or the first of what begins nowhere."""
+    return min(
+        candidate.forms, key=lambda f: next((abs(p.value - _SLIPS_AT) for p in f.term.parameters if p.discrete), 0)
+    )
 
 
 def sweep_summary(rows: list[Row]) -> list[str]:

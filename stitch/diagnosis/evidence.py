@@ -470,24 +470,33 @@ def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | N
 
 
 def does_the_arm_do_what_hangs_at_it(case: Case, evidence: Evidence) -> Reply | None:
-    """Does an effect of the arm do what a holder of light targets is said to do?
+    """Does an effect of the arm do what hangs at it is said to do, or what hangs at it the jump of a joint?
 
-    Over a sweep of few joints gravity bends either alike, and reflectors weigh grams: these views cannot tell.
+    Over a sweep of few joints gravity bends either alike, and reflectors weigh grams: these views cannot tell. Nor does
+    any view tell a step of the last joint from a part that turned about its axis.
     """
     linear = case.linear
-    if evidence.verdict != "missing_effect" or linear.measurement.capture.scans:
+    if evidence.verdict != "missing_effect":
         return None
-    scored = evidence.named[0].score
-    if not any(need.startswith("gravity_at") for need in scored.candidate.effect.needs):
+    named = evidence.named[0]
+    scored = named.score
+    effect = scored.candidate.effect
+    jumps = effect.place in ARM_PLACES and any(p.discrete for p in scored.candidate.parameters)
+    droops = not linear.measurement.capture.scans and any(need.startswith("gravity_at") for need in effect.needs)
+    if not jumps and not droops:
         return None
     pattern = linear.residual(scored.form.columns) @ scored.values
     alike = []
     for r in filter(is_contender, evidence.ranked):
-        whole = r.score.candidate.forms[0]
-        of_arm = r.score.candidate.effect.place in ARM_PLACES and not whole.term.gridded.any()
-        if of_arm and imitated_share(pattern, linear.residual(whole.columns) * whole.sizes) > limits.ALIAS_CORRELATION:
+        of_arm = r.score.candidate.effect.place in ARM_PLACES
+        form = r.score.form if jumps else r.score.candidate.forms[0]
+        if of_arm == jumps or form.term.gridded.any() != jumps:
+            continue
+        least = limits.SAME_CORRELATION if jumps else limits.ALIAS_CORRELATION
+        if imitated_share(pattern, linear.residual(form.columns) * form.sizes) > least:
             alike.append(r)
-    changes = {"explanation": (*alike, *evidence.named), "further": None, "together": ()} if alike else {}
+    explanation = (named, *alike) if jumps else (*alike, named)
+    changes = {"explanation": explanation, "further": None, "together": ()} if alike else {}
     return Reply(_names(alike) or "no", changes)
 
 

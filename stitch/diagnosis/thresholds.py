@@ -77,6 +77,8 @@ CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
 
 # Effects whose patterns correlate more than this are aliases in these views; beyond the second they are listed as such.
 ALIAS_CORRELATION, LISTED_ALIAS_CORRELATION = 0.9, 0.7
+# Beyond this they are one and the same, whatever the views: what is left is rounding, and the prior's share.
+SAME_CORRELATION = 0.999
 # λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
 SEPARATION_LAMBDA = 5.4
 # p-value below which what is left is said to follow a covariate (custom), and bins that show the shape.

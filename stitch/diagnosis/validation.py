@@ -35,7 +35,7 @@ class CrossValidation:
 
     inside: float  # fitted on all views
     heldout: float  # each fold judged by a fit without it
-    poses: float  # the same for the free-network poses, in units of their scatter, without the sensor's noise
+    poses: float  # the same for the poses, in units of their scatter: of clouds without the sensor's noise
     poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
     heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples

@@ -208,13 +208,13 @@ class LinearModel:
         return self.mixed.covariance(self.null.variances)
 
     @cached_property
-    def _whitening(self) -> Array:
+    def whitening(self) -> Array:
         """(B, m, m) inverse Cholesky factors of the null's covariance."""
         return whitener(self.mixed, self.null.variances)
 
     def whiten(self, columns: Array, blocks: Indices | None = None) -> Array:
         """Return columns (n, P) in units of the null's scatter; of some of the blocks alone, if named."""
-        X, half = self.in_blocks(columns), self._whitening
+        X, half = self.in_blocks(columns), self.whitening
         if blocks is not None:
             X, half = X[blocks], half[blocks]
         return (half @ X).reshape(-1, columns.shape[1])

@@ -92,7 +92,7 @@ class Rows(Observation):
 
     def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> "RowTrial":
         """Return a model with the columns of rows (B·m, k)."""
-        return RowTrial(self, linear.covariance, linear.in_blocks(response))
+        return RowTrial(self, linear, linear.in_blocks(response))
 
     def affected_squares(self, views: Indices) -> Mask:
         """Return the views themselves, (V,) bool."""
@@ -199,16 +199,16 @@ def row_model(measurement: Measurement, model: Model, rows: Rows) -> LinearModel
 
 @dataclass(frozen=True)
 class RowTrial:
-    """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
+    """Columns of rows with the covariance of the null, fitted as a run fits them."""
 
     rows: Rows
-    covariance: Array  # (B, m, m)
-    X: Array
+    linear: LinearModel
+    X: Array  # (B, m, k)
 
     @cached_property
     def blocks(self) -> BlockLeastSquares:
         nothing = np.zeros(self.X.shape[2])
-        return BlockLeastSquares(-self.rows.residual, self.X, self.covariance, nothing, nothing)
+        return BlockLeastSquares(-self.rows.residual, self.X, self.linear.covariance, nothing, nothing)
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) without some views."""
@@ -225,10 +225,9 @@ class RowTrial:
         return np.sum(self._rest(coefficients, units) ** 2 * self.rows.distances_used[units], axis=1)
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Of the left-out views' distances, in units of the sensor's noise: each is seen as it is."""
-        used = self.rows.distances_used[left_out]
-        rest = self._rest(coefficients, left_out)
-        return float(np.sum(rest[used] ** 2 / self.rows.noise[left_out][used]))
+        """Sum of the squares of what left-out views show, in units of their scatter and the sensor's noise."""
+        rest = self._rest(coefficients, left_out) * self.rows.used[left_out]
+        return float(np.sum((self.linear.whitening[left_out] @ rest[..., None]) ** 2))
 
     def influential_views(self, coefficients: Array) -> Indices:
         """(n,) the views without which the coefficients would move most, to first order."""

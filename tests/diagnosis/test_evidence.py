@@ -6,8 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bench.points import swept_joints, swept_session
 from data_synth import kinematics
+from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch import diagnose, run
 from stitch.diagnosis import evidence as gathering
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import find_missing_pair, gather_evidence, pair_is_validated
@@ -343,3 +346,10 @@ def test_of_two_that_are_missing_the_one_of_a_believable_size_is_named():
     assert "joint_compliance is missing too, but x1 is larger than is believable" in after.notes
     alone = replace(found, further=None, together=(large,))
     assert gathering.ask([gathering.is_its_size_believable], NO_CASE, alone).named == (large,)
+
+
+def test_a_step_of_the_last_joint_and_a_part_that_turned_about_its_axis_are_not_told_apart():
+    rng = np.random.default_rng(409)
+    joints = swept_joints(ARMS["ABB IRB 120"], 6, rng)
+    found = diagnose(run(swept_session(joints, 0.0, rng, ("part_slip", "rz", -3.1e-4))))
+    assert found.verdict == "cannot_tell" and found.effects == ("joint_step", "part_slip")

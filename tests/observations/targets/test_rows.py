@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from bench.real_arms import THREE_SIGMA, turning, turning_session
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -17,6 +18,7 @@ from stitch.model.forward import PointSlopes, corrected_capture, target_correcti
 from stitch.model.model import Model, term_of
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
 from stitch.observations.targets.rows import initial_landmarks, target_rows
+from stitch.observations.targets.target_model import target_model
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 
@@ -132,3 +134,12 @@ def test_three_views_of_one_target_do_not_show_it():
     session, *_ = labelled_cell(2, views=3, targets=np.array([[60.0, 10.0, 30.0]]))
     with pytest.raises(NoResultError, match="do not show the hand-eye"):
         closed_form_hand_eye(prepare_capture(session))
+
+
+def test_what_left_out_views_show_counts_as_many_squares_as_numbers_in_units_of_their_scatter():
+    session, T_mount, *_ = labelled_cell(5, views=80)
+    linear = target_model(measurement_of(session, prepare_capture(session)), Model(T_mount), None)
+    trial = linear.baseline_trial
+    squares = trial.scatter(np.arange(80), trial.solve())
+    numbers = linear.mixed.z.size
+    assert chi2.ppf(1e-4, numbers - linear.design.shape[1]) < squares < chi2.ppf(1 - 1e-4, numbers)
