@@ -193,6 +193,15 @@ def view_notes(
 def target_notes(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, clouds that were not used, and a widened covariance."""
     notes = _unused_points(targets, outliers, session)
+    fitted, most = (
+        targets.rows.sightings.target.shape[1],
+        max(len(v.sighting.targets) for v in session.views if v.sighting),
+    )
+    if fitted < most:
+        notes.append(
+            f"Of {most} labelled points of a view at most {fitted} were fitted, others in each view: more take memory "
+            "and time, and show the poses no better than these scatter."
+        )
     if any(view.cloud is not None for view in session.views):
         notes.append("Some views have no cloud: only the labelled points were fitted.")
     if targets.inflation > _WIDENED:

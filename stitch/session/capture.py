@@ -31,6 +31,9 @@ from stitch.system.values import take_rows
 _USUAL_SIGMA_M = 1e-5
 # A probe's own targets lie some 20 cm apart: that is how well it knows its direction, unless it says so itself.
 _PROBE_LEVER_M = 0.2
+# Views times the square of the points of each, 72 bytes of covariance for each, and the fewest points of a view: a pose
+# scatters by more than a dozen points show of it.
+_MOST_PRODUCTS, _FEWEST_POINTS = 8e5, 12
 # Points of a session whose neighbours may all be held at once, 70 bytes each.
 _AT_ONCE = 1_000_000
 
@@ -60,6 +63,21 @@ class Sightings:
     def points_by_view(self) -> list[Array]:
         """Per view the points in use, (k, 3); none where it shows nothing."""
         return [points[used] for points, used in zip(self.points, self.used, strict=True)]
+
+    def at_most(self, count: int) -> "Sightings":
+        """Return the sightings with so many points of each view, spread over its targets: of the next view others."""
+        if count >= self.target.shape[1]:
+            return self
+        slots = np.full((len(self.target), count), -1)
+        for view, target in enumerate(self.target):
+            seen = np.flatnonzero(target >= 0)
+            if len(seen) > count:
+                seen = seen[(view + np.arange(count) * len(seen) // count) % len(seen)]
+            slots[view, : len(seen)] = seen
+        rows, there = np.arange(len(slots))[:, None], slots >= 0
+        points = np.where(there[..., None], self.points[rows, slots], 0.0)
+        target, used = np.where(there, self.target[rows, slots], -1), self.used[rows, slots] & there
+        return replace(self, target=target, points=points, sigma=self.sigma[rows, slots], used=used)
 
     def without(self, left_out: Indices) -> "Sightings":
         """Return the sightings less some views."""
@@ -166,7 +184,10 @@ def prepare_capture(session: SessionData) -> Capture:
             f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
             "surface; to fix: clouds swept over the part, or, of profiles of one sphere, stitch calibrate sphere"
         )
-    return of_scanners(session, build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session)))
+    sightings = sightings_of(session)
+    if sightings is not None and not scans:
+        sightings = sightings.at_most(max(int(np.sqrt(_MOST_PRODUCTS / len(sightings.target))), _FEWEST_POINTS))
+    return of_scanners(session, build_capture(session.name, scans, T_base_flange, session.mount, sightings))
 
 
 def of_scanners(session: SessionData, capture: Capture) -> Capture:
