@@ -14,26 +14,19 @@ import numpy as np
 
 from bench.drawn_cells import SCENES, LinearCell, World, linear_cell, seen, true_column, with_overlaps_of
 from bench.harness import Row, Table, grouped, markdown, share
+from bench.small_cells import LIBRARY, drawn, smallest
 from data_synth import nature
 from data_synth.laws.unnamed import IN_TIME, UNNAMED
-from data_synth.moment import Plan
 from data_synth.ordinary_arm import draw_arm, with_memory
-from data_synth.scene import load_scene
-from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
-from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import ScatterLimit, form_weights
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors
 from stitch.diagnosis.verdict import Evidence
 from stitch.effects import EFFECTS
-from stitch.effects.contract import missing_need
 from stitch.observations.linear_model import LinearModel
-from stitch.session.measurement import Measurement
 
-# The beams of brackets are written in other numbers than the library's.
-LIBRARY = tuple(name for name in nature.LAWS if name in EFFECTS and not name.endswith(("_droop", "_bend")))
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 MULTIPLES = (1, 2, 3, 4, 6)
 # Worlds with several effects, asked again after each that is named.
@@ -153,51 +146,10 @@ def _in_turn(names: Sequence[str], k: int) -> str:
 def _at(cell: LinearCell, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> Drawn:
     chance = int(rng.integers(1 << 30))
     plain = cell.linear.restricted(())
-    true = _drawn(cell.name, cell.plan, cell.measurement, laws, chance)
-    sizes = {law: _smallest(plain, law, true[law]) for law in laws}
+    true = drawn(cell.name, cell.plan, cell.measurement, laws, chance)
+    sizes = {law: smallest(plain, law, true[law]) for law in laws}
     hidden = {law: multiple * size for law, size in sizes.items() if size is not None}
     return World(_laws(cell, hidden, np.random.default_rng([chance, 2]))), tuple(hidden)
-
-
-def _drawn(
-    name: str, plan: Plan, measurement: Measurement, laws: Sequence[str], chance: int
-) -> dict[str, dict[str, float]]:
-    """Return what nature draws for these laws, in this order, at amplitude 1 in this very cell, as a model counts
-    it."""
-    out = nature.draw(dict.fromkeys(laws, 1.0), 0.0, plan, np.random.default_rng([chance, 2]))[1]
-    if "part_growth" in out:
-        # About another origin than the part's own, growth is a motion too.
-        off = measurement.scan_views[0].origin - load_scene(name).T_reference_part[:3, 3]
-        out["part_growth"] |= dict(zip(("cx", "cy", "cz"), out["part_growth"]["g"] * off, strict=True))
-    return out
-
-
-def _smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float | None:
-    """Return the factor on the parameters `true` that is detectable at the least; None where cell or belief cannot
-    hold it."""
-    if missing_need(linear.measurement, EFFECTS[effect]) or not true:
-        return None
-    candidate = candidate_of(linear, EFFECTS[effect])
-    if candidate is None:
-        return None
-    linear = linear.restricted(linear.causes - {effect})
-    values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
-    fitted = np.array([not p.grid for p in candidate.parameters])
-    sizes = []
-    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        # Forms that hold all of the truth, at the value of the grid that is nearest to it.
-        off = np.abs(form.term.values - values)[~fitted].sum()
-        if not values[fitted & ~form.keep].any():
-            white = linear.residual(form.columns)
-            freedom = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
-            scales = regime_of(linear).scales
-            least = least_noncentrality(white * form.sizes, float(weight), len(EFFECTS), freedom, scales)
-            sizes.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
-    nearest = min(off for off, _ in sizes)
-    amplitude = float(min(size for off, size in sizes if off == nearest))
-    # Four times that must still be of a size that somebody would believe.
-    limits = np.array([p.limit for p in candidate.parameters])
-    return amplitude if (np.abs(values) * 4 * amplitude < limits)[fitted].all() else None
 
 
 def jobs(seeds: range, before: bool, fewer: int) -> Iterator[Row]:

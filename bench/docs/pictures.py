@@ -1,7 +1,7 @@
 """Pictures of the pages: python -m bench.docs.pictures scenes|cells|report|architecture [NAME …].
 
 `scenes`: every scene, the part with the scanner where the views are taken. `cells`: figures and pages of the cells,
-from the jobs in examples/. `report`: page and recording of the demo's cell, as
+from the jobs in examples/, and closed loops of panel and door. `report`: page and recording of the demo's cell, as
 people see them, light, dark, on a phone, and two runs side by side; or of the run folder that is named. `architecture`:
 the rooms of stitch from its import graph; floors come from the import rules in pyproject.toml, arrows from the imports
 themselves, so that the picture cannot say what the code does not.
@@ -99,25 +99,46 @@ def cells(chosen: list[str]) -> None:
     for name, (figure, dpi) in _figures().items():
         figure.savefig(PICTURES / f"{name}.png", dpi=dpi)
         print(PICTURES / f"{name}.png")
+    _in_colours(PICTURES / "window-map.png", 256)
 
 
 def _figures() -> dict[str, tuple[Any, int]]:
     """By the picture's name, with its resolution."""
+    from bench import panel, window
+    from stitch.errors import NoResultError
     from stitch.plugins.cells.base_to_base import read_stand, solve_stand
     from stitch.plugins.cells.drilling import read_drill_job, solve_drill_job
     from stitch.plugins.cells.panel import read_panel_job, solve_panel_job
+    from stitch.plugins.cells.panel_model import SHAPE_AXES, errors_along_motion
+    from stitch.plugins.cells.scan_to_cad import measure_deviations
     from stitch.plugins.cells.window import read_seam_job, solve_seam
     from viz.cells import base_to_base, window_seam
     from viz.cells.drilling import holes
-    from viz.cells.panel import shape
+    from viz.cells.panel import errors_figure, shape, shape_figure
+    from viz.cells.window_fit import deviation_map
 
     stand, drilling = read_stand(EXAMPLES / "base_to_base.toml"), read_drill_job(EXAMPLES / "drilling" / "job.toml")
     job, seam = read_panel_job(EXAMPLES / "panel" / "job.toml"), read_seam_job(EXAMPLES / "window" / "seam.toml")
+    ready = panel.ready_without_panel(0)
+    moved = (ready.setup.models, ready.T_base_flange, panel.MASTER)
+    shift = errors_along_motion(*moved, np.linspace(0, 100, 11), turn=False)
+    turn = errors_along_motion(*moved, np.radians(np.linspace(0, 2, 11)), turn=True)
+    try:
+        run = panel.shape_run(0, True, SHAPE_AXES, tolerance=0.25)
+    except NoResultError:
+        run = panel.shape_run(0, True, SHAPE_AXES)
+    forces = np.array([np.linalg.norm(f[:, 3:], axis=1).max() for f in run.forces])
+    scan, _, fit = window.fitted_case("door, welding bulge 3 mm, σ 130 mm", 0)
+    _, surface = window.part_of("door")
+    deviations = measure_deviations(scan, surface, fit.T_base_part, 0.5, surface.size / 60)
     return {
         "base-to-base": (base_to_base.plan(stand, solve_stand(stand)), 95),
         "drilling": (holes(drilling, solve_drill_job(drilling)), 95),
         "panel-clamps": (shape(job, solve_panel_job(job)), 95),
         "window-seam": (window_seam.cuts(seam, solve_seam(seam)), 95),
+        "panel-errors": (errors_figure(panel.NAMES, panel.MASTER, shift, turn), 110),
+        "panel-shape": (shape_figure(panel.NAMES, run.deviations, panel.TOLERANCE, forces), 110),
+        "window-map": (deviation_map(deviations, "mm"), 100),
     }
 
 
