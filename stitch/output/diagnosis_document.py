@@ -9,14 +9,11 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.systematic_laws import law_of, law_size
-from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.diagnosis.validation import CrossValidation
-from stitch.numerics.frames import Array
-from stitch.observations.surfaces.field_error import FieldError
 from stitch.output.finding_screen import clearest_parameter, finding_screen
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import parameter_row
-from stitch.output.schema import NUMBER, NUMBER_OR_NULL, TEXT, Document, Key, Kind, list_of, rows_of_fields
+from stitch.output.schema import NUMBER, NUMBER_OR_NULL, TEXT, Document, Key, Kind, list_of, rows_of
 
 FORMAT = "stitch-diagnosis/1"
 _RIVALS = 5  # the likeliest, which stand beside a candidate
@@ -121,34 +118,6 @@ def _parameters(score: Score) -> dict[str, Any]:
     return rows
 
 
-def _field_map(scanner_error: FieldError | None) -> dict[str, Any] | None:
-    """Return where in its field the scanner errs along the ray, in length_unit; null where too few points were seen."""
-    if scanner_error is None or (field_map := scanner_error.map) is None:
-        return None
-
-    def with_nulls(values: Array) -> list[list[float | None]]:
-        return [[x if np.isfinite(x) else None for x in row] for row in values.tolist()]
-
-    return {
-        "x_over_z": field_map.x.tolist(),
-        "y_over_z": field_map.y.tolist(),
-        "error": with_nulls(field_map.error),
-        "sigma": with_nulls(field_map.sigma),
-    }
-
-
-def _time_law(curve: TimeCurve | None) -> dict[str, Any] | None:
-    """Return when in the session a flange errs by no known law, in its own frame; rotation in rad, then translation."""
-    if curve is None:
-        return None
-    return {
-        "steps": curve.steps.tolist(),
-        "seconds_a_step": curve.seconds or None,
-        "error": curve.error.tolist(),
-        "sigma": curve.sigma.tolist(),
-    }
-
-
 def _law_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return the laws of the dictionary that are told: rivals of a name, or what is found where none is given."""
     rows = []
@@ -166,7 +135,15 @@ _CANDIDATE = Document(
     Key("hand_eye_if_missed", NUMBER_OR_NULL, optional=True),
     Key("left_out", Kind({"type": ["object", "null"], "additionalProperties": NUMBER.schema}), optional=True),
 )
-_NEXT = "do separates joints_deg views T_base_flange wait_s probability"
+# Where in its field the scanner errs along the ray, in length_unit; null where too few points were seen.
+_NULLS = Kind({}, lambda values: np.where(np.isfinite(values), values, np.array(None)).tolist())
+_FIELD_MAP = Document(
+    Key("x_over_z", attribute="x"), Key("y_over_z", attribute="y"), Key("error", _NULLS), Key("sigma", _NULLS)
+)
+# When in the session a flange errs by no known law, in its own frame; rotation in rad, then translation.
+_TIME_LAW = Document(
+    Key("steps"), Key("seconds_a_step", write=lambda curve: curve.seconds or None), Key("error"), Key("sigma")
+)
 _TRIED = Document(Key("effect", TEXT, write=itemgetter(0)), Key("dropped", TEXT, write=itemgetter(1)))
 # Lengths in length_unit, angles in rad.
 DIAGNOSIS = Document(
@@ -180,18 +157,13 @@ DIAGNOSIS = Document(
     Key("noise_floor"),
     Key("repeatability", write=lambda d: {"rotation": d.rotation, "translation": d.translation}),
     Key("candidates", Kind(list_of(_CANDIDATE.kind()).schema), write=_candidate_rows, optional=True),
-    Key(
-        "depends_on",
-        write=lambda d: rows_of_fields(d.depends_on, "covariate place score p_value bins mean sigma shape"),
-    ),
+    Key("depends_on", rows_of("covariate place score p_value bins mean sigma shape")),
     Key("laws", write=_law_rows),
     Key("places"),
     # Along what a joint errs by no known law, in the unit of its covariate; errors in rad.
-    Key("joint_laws", write=lambda d: rows_of_fields(d.curves, "joint covariate share at error sigma may_follow")),
-    Key("time_law", write=lambda d: _time_law(d.time_curve)),
-    Key(
-        "next", write=lambda d: rows_of_fields(d.next, "do separates joints_deg views T_base_flange wait_s probability")
-    ),
+    Key("joint_laws", rows_of("joint covariate share at error sigma may_follow"), "curves"),
+    Key("time_law", _TIME_LAW.or_null(), "time_curve"),
+    Key("next", rows_of("do separates joints_deg views T_base_flange wait_s probability")),
     Key("next_command", write=lambda d: suggested_command(d, "RUN")),
     Key(
         "alias_matrix",
@@ -205,8 +177,8 @@ DIAGNOSIS = Document(
     Key("doubts"),
     Key("together"),
     Key("tried", _TRIED.rows(), write=lambda d: d.tried.items(), optional=True),
-    Key("budget", write=lambda d: rows_of_fields(d.budget, "source variance_share sigma unit")),
-    Key("field_map", write=lambda d: _field_map(d.scanner_error)),
+    Key("budget", rows_of("source variance_share sigma unit")),
+    Key("field_map", _FIELD_MAP.or_null(), write=lambda d: d.scanner_error and d.scanner_error.map),
     Key("views", write=lambda d: d.linear.measurement.views.count),
     Key("evidence", write=lambda d: d.linear.mixed.size),
     Key("screen", write=finding_screen),

@@ -5,7 +5,7 @@ What writes a document and what reads it follow the same table, so that a key st
 
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -74,6 +74,11 @@ def array_of(*shape: int) -> Kind:
     return Kind(kind.schema, plain, lambda rows: np.array(rows, float))
 
 
+def rows_of(fields: str) -> Kind:
+    """Return the kind of a list that is not read again: a row an item, with some of its fields."""
+    return Kind({}, Document(*map(Key, fields.split())).rows().write)
+
+
 TEXTS = list_of(TEXT)
 MATRIX = array_of(4, 4)
 
@@ -99,7 +104,7 @@ class Document:
     @property
     def schema(self) -> Schema:
         """What is checked before a document is read, as JSON Schema."""
-        checked = [key for key in self.keys if key.kind is not ANYTHING]
+        checked = [key for key in self.keys if key.kind.schema]
         return {
             "type": "object",
             "properties": {key.name: key.kind.schema for key in checked},
@@ -119,21 +124,20 @@ class Document:
         return {
             (key.attribute or key.name).rpartition(".")[2]: key.kind.read(document[key.name])
             for key in self.keys
-            if key.of is of and key.kind is not ANYTHING and (key.name in document or not (key.optional or key.when))
+            if key.of is of and key.kind.schema and (key.name in document or not (key.optional or key.when))
         }
 
     def kind(self, build: Callable[..., Any] = dict) -> Kind:
         """Return the kind of one such object, read as what is built of its fields."""
         return Kind(self.schema, self.write, lambda row: build(**self.fields(row)))
 
+    def or_null(self) -> Kind:
+        """Return the kind of one such object that is not read again; null where there is none."""
+        return Kind({}, lambda source: None if source is None else self.write(source))
+
     def rows(self, build: Callable[..., Any] = dict) -> Kind:
         """Return the kind of a list of such objects."""
         return list_of(self.kind(build))
-
-
-def rows_of_fields(items: Iterable[Any], fields: str) -> list[dict[str, Any]]:
-    """Return one row an item with some of its fields, arrays and tuples as lists."""
-    return [{name: plain(getattr(item, name)) for name in fields.split()} for item in items]
 
 
 def read_checked(file: Path, schema: Schema) -> Any:

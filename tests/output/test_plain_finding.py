@@ -17,7 +17,7 @@ from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from stitch.output.comparison.run_verdict import prediction_text
-from stitch.output.diagnosis_document import _field_map
+from stitch.output.diagnosis_document import DIAGNOSIS
 from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_in_words
 from stitch.screening.pose_tests import PoseStep
@@ -227,11 +227,16 @@ def test_a_map_is_written_with_null_where_nothing_was_seen():
     drawn = FieldMap(
         np.array([-0.2, 0.2]), np.array([-0.1, 0.0, 0.1]), error, np.where(np.isfinite(error), 0.002, np.nan)
     )
-    written = _field_map(FieldError(0.02, 0.0, 9.0, over_noise=True, map=drawn))
+
+    def map_of(scanner_error):
+        key = next(key for key in DIAGNOSIS.keys if key.name == "field_map")
+        return key.kind.write(key.write(SimpleNamespace(scanner_error=scanner_error)))
+
+    written = map_of(FieldError(0.02, 0.0, 9.0, over_noise=True, map=drawn))
     assert written["x_over_z"] == [-0.2, 0.2] and written["y_over_z"] == [-0.1, 0.0, 0.1]
     assert written["error"] == [[0.01, None], [-0.01, 0.0], [0.02, 0.03]]
     assert written["sigma"][0] == [0.002, None]
-    assert _field_map(FieldError(0.02, 0.0, 9.0, over_noise=True)) is _field_map(None) is None
+    assert map_of(FieldError(0.02, 0.0, 9.0, over_noise=True)) is map_of(None) is None
 
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "adequate", "unknown_effect"])

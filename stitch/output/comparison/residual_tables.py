@@ -516,7 +516,7 @@ def comparison_document(comparison: ResidualTables) -> dict[str, object]:
     """Return compare.json: the tables as plain lists."""
     return {
         "rms": comparison.rms,
-        "follows": [_FOLLOWED.write(followed) for followed in comparison.followed],
+        "follows": _FOLLOWED.rows().write(comparison.followed),
         "means": comparison.means,
         "tables": [_table_row(comparison, table) for table in comparison.tables],
         "views": [
