@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.ranking import Ranked
-from stitch.diagnosis.systematic_laws import STEP, Dictionary, Law, Span, dictionary_of
+from stitch.diagnosis.systematic_laws import STEP, Dictionary, Law, Span, dictionary_of, stacked
 from stitch.diagnosis.thresholds import DEPENDENCE_BINS, FAINT_SIGMAS
-from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space, fit_columns
@@ -79,18 +78,18 @@ def dependences(
         dictionary: of these views, where it is known.
     """
     linear = linear.restricted(())
-    whole = (dictionary or dictionary_of(linear)).whole_laws()
-    if not whole:
+    laws = [law for law in (dictionary or dictionary_of(linear)).laws if law.is_whole]
+    if not laws:
         return ()
-    laws, columns = zip(*whole, strict=True)
-    clearest = _may_be_clearest(linear, laws, columns)
+    clearest = _may_be_clearest(linear, laws)
+    columns = {k: laws[k].reduced(linear.observation) * laws[k].sizes for k in clearest}
     p_values = np.ones(len(laws))
-    p_values[clearest] = _p_values(linear, [columns[k] for k in clearest])
-    alike = _followed_alike(laws, columns, named)
+    p_values[clearest] = _p_values(linear, list(columns.values()))
+    alike = _followed_alike(linear, laws, named)
     best: dict[str, int] = {}
-    for k in np.argsort(p_values, kind="stable"):
+    for k in sorted(clearest, key=lambda k: (p_values[k], k)):
         if laws[k].driver.name not in alike:
-            best.setdefault(laws[k].driver.name, int(k))
+            best.setdefault(laws[k].driver.name, k)
     first, *others = best.values()
     beside = dict(
         zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
@@ -103,30 +102,36 @@ def dependences(
     )
 
 
-def _may_be_clearest(linear: LinearModel, laws: Sequence[Law], columns: Sequence[Array]) -> list[int]:
+def _may_be_clearest(linear: LinearModel, laws: Sequence[Law]) -> list[int]:
     """Return the few laws of each covariate that explain most, as if all scatter were known alike."""
-    known = linear.mixed.size - linear.design.shape[1]
+    known = max(linear.mixed.size - linear.design.shape[1], 1)
     by_driver: dict[str, list[tuple[float, int]]] = {}
-    for k, (information, vector) in enumerate(linear.information([SelectedColumns(X) for X in columns])):
-        values, vectors = np.linalg.eigh(information)
-        seen = values > _NEW_SHARE**2 * max(values[-1], _NOTHING)
-        rank = int(seen.sum())
-        square = float(np.sum((vectors[:, seen].T @ vector) ** 2 / values[seen]))
-        chance = f_tail(square / rank, rank, max(known, 1)) if rank else 1.0
-        by_driver.setdefault(laws[k].driver.name, []).append((chance, k))
+    for place, shapes, index in stacked(laws):
+        sizes = laws[index[0, 0]].sizes
+        information, vector = linear.information_of_motions(place.twists[:, :, place.whole], shapes)
+        values, vectors = np.linalg.eigh(information * np.outer(sizes, sizes))
+        seen = values > _NEW_SHARE**2 * np.maximum(values[:, -1:], _NOTHING)
+        explained = np.einsum("sij,si->sj", vectors, vector * sizes) ** 2 / np.where(seen, values, np.inf)
+        for k, square, rank in zip(index[:, 0].tolist(), explained.sum(axis=1), seen.sum(axis=1).tolist(), strict=True):
+            chance = f_tail(float(square) / rank, rank, known) if rank else 1.0
+            by_driver.setdefault(laws[k].driver.name, []).append((chance, k))
     return [k for chances in by_driver.values() for _, k in sorted(chances)[:_ASKED_OF_EACH]]
 
 
-def _followed_alike(laws: Sequence[Law], columns: Sequence[Array], named: Sequence[Ranked]) -> set[str]:
+def _followed_alike(linear: LinearModel, laws: Sequence[Law], named: Sequence[Ranked]) -> set[str]:
     """Return covariates that run in these views as one does that a named effect follows, and are not its own."""
+    drivers = {law.driver.name: law.driver.values for law in laws}
+    runs = np.atleast_2d(np.corrcoef(list(drivers.values())))
+    twins = dict(zip(drivers, (np.abs(runs) > 1 - _ALIKE).sum(axis=1) > 1, strict=True))
     clear = [Span(r.score.form.columns[:, np.abs(r.score.values) > FAINT_SIGMAS * r.score.sigmas]) for r in named]
     own = {
         law.driver.name: law.driver.values
-        for law, X in zip(laws, columns, strict=True)
+        for law in laws
+        if twins[law.driver.name]
         if law.place.joint is None or law.driver.name.startswith(f"j{law.place.joint}_")
-        if any(of_effect.contains(Span(X)) for of_effect in clear)
+        if any(of_effect.contains(Span(law.reduced(linear.observation) * law.sizes)) for of_effect in clear)
     }
-    others = {law.driver.name: law.driver.values for law in laws if law.driver.name not in own}
+    others = {name: x for name, x in drivers.items() if name not in own}
     return {name for name, x in others.items() if any(abs(np.corrcoef(x, y)[0, 1]) > 1 - _ALIKE for y in own.values())}
 
 

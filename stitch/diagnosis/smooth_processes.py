@@ -15,7 +15,6 @@ from stitch.diagnosis import thresholds as limits
 from stitch.effects.contract import EFFECTS
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import term_of
-from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.kernels import REACH, SHORT_REACH, exponential_kernel, rbf_joints
 from stitch.numerics.reml import VarianceFit, fit_variances
@@ -138,7 +137,7 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> tuple[float, fl
     Over the eigenvalues k of the columns' information and the shares g of what was observed: log BF(s) =
     ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
     """
-    information, vector = next(linear.information([SelectedColumns(process.columns(linear))]))
+    (information,), (vector,) = linear.information_of_motions(process.motions, process.shapes[None])
     k, vectors = np.linalg.eigh(information)
     k, g = np.maximum(k, 0.0), vectors.T @ vector
     if not k[-1] > 0:

@@ -31,7 +31,6 @@ from stitch.effects.contract import EFFECTS, Effect, Parameter, per_joint
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import Term, term_of
 from stitch.numerics import frames
-from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.distributions import f_limits
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import column_space
@@ -57,8 +56,6 @@ _NEAR_BEFORE = 2.0
 # Two columns of which this share is common are one.
 _SAME = 0.999
 _SAME_VALUE = 1e-9
-# Bytes of columns that are held from one question to the next.
-_HELD = 60e6
 # Directions of the flange to whose other side gravity may drop what hangs there with play.
 _ACROSS = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
 _FALLS = ("along x", "between x and y", "along y", "between y and -x", "along z")
@@ -190,38 +187,17 @@ class Dictionary:
         return replace(effect, log_posterior=effect.log_posterior + more)
 
     @cached_property
-    def stems(self) -> dict[Law, Indices]:
-        """Laws that are alike but for the place's axes: by the one of all axes, the numbers of those it holds."""
-        stems: dict[tuple[str, str, str, bool], list[int]] = {}
+    def numbers(self) -> dict[tuple[str, str], list[int]]:
+        """Numbers of the forms of each law that is told from the others."""
+        numbers: dict[tuple[str, str], list[int]] = {key: [] for key in self.said_by}
         for i, law in enumerate(self.laws):
-            stems.setdefault((*law.key, law.shape, law.centred), []).append(i)
-        return {
-            replace(self.laws[index[0]], columns=np.arange(self.laws[index[0]].place.twists.shape[2])): np.array(index)
-            for index in stems.values()
-        }
-
-    def columns(self) -> Iterator[tuple[Law, Indices, Array]]:
-        """Give each stem, the numbers of its laws and its columns (n, k·R) per usual size: held, unless too large."""
-        for stem, index in self.stems.items():
-            held = self._held.get(stem)
-            columns = stem.reduced(self.observation) * stem.sizes if held is None else held
-            if held is None and columns.nbytes < _HELD / len(self.stems):
-                self._held[stem] = columns
-            yield stem, index, columns
-
-    def whole_laws(self) -> list[tuple[Law, Array]]:
-        """Return the laws of all six numbers, or of a joint or link, with their columns (n, k·R)."""
-        laws = ((self.laws[i], columns) for _, index, columns in self.columns() for i in index)
-        return [(law, columns[:, law.among]) for law, columns in laws if law.is_whole]
+            numbers[law.key].append(i)
+        return numbers
 
     @cached_property
-    def _held(self) -> dict[Law, Array]:
-        return {}
-
-    @property
-    def keys(self) -> list[tuple[str, str]]:
-        """All that are told from each other."""
-        return list(self.said_by)
+    def stacks(self) -> list[tuple[Place, Array, Indices]]:
+        """All laws as `stacked`."""
+        return list(stacked(self.laws))
 
     def without(self, linear: LinearModel, laws: Sequence[Ranked], effect: Ranked) -> tuple[Ranked, ...]:
         """Return those of some laws that an effect does not say, nor does at its own place in these views."""
@@ -258,6 +234,19 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
     return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
 
 
+def stacked(laws: Sequence[Law]) -> Iterator[tuple[Place, Array, Indices]]:
+    """Give laws of one place and as many shapes together: the place, shapes (S, V, R), numbers (S, F) of their forms.
+
+    F is how many choices of the place's axes each has, the whole first.
+    """
+    alike: dict[tuple[str, int], list[int]] = {}
+    for i, law in enumerate(laws):
+        alike.setdefault((law.place.name, law.shapes.shape[1]), []).append(i)
+    for numbers in alike.values():
+        shapes = [laws[i].shapes for i in numbers if laws[i].columns is laws[i].place.whole]
+        yield laws[numbers[0]].place, np.array(shapes), np.reshape(numbers, (len(shapes), -1))
+
+
 def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]:
     """Return the likeliest laws beside a model, best first, with their log posterior as that of effects (`Ranked`)."""
     laws = dictionary.laws
@@ -273,10 +262,8 @@ def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]
         gains, scales = np.where(better, tried, gains), np.where(better, scale, scales)
         best_start[better] = k
     weighted = gains + np.log(dictionary.shares)
-    by_key: dict[tuple[str, str], list[int]] = {key: [] for key in dictionary.keys}
-    for i, law in enumerate(laws):
-        by_key[law.key].append(i)
-    order = sorted(by_key, key=lambda key: -logsumexp(weighted[by_key[key]]))
+    by_key = dictionary.numbers
+    order = sorted(by_key, key=lambda key: -np.logaddexp.reduce(weighted[by_key[key]]))
     likeliest = order[:_LAWS_FITTED]
     if weighted.max() > limits.LOG_BAYES_FACTOR:
         # Where it acts is told too: of every place that may be the one, its likeliest.
@@ -322,7 +309,7 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
     for rank, laws in by_rank.items():
         if not rank:
             continue
-        least = np.array([by_count * share for _, share in laws]) / len(dictionary.keys)
+        least = np.array([by_count * share for _, share in laws]) / len(dictionary.numbers)
         limit = rank * f_limits(np.minimum(least, 1.0), rank, known)
         squares = (np.hstack([U for U, _ in laws]).T @ drawn) ** 2
         as_clear |= (squares.reshape(len(laws), rank, -1).sum(axis=1) >= limit[:, None]).any(axis=0)
@@ -399,24 +386,23 @@ def _no_function(*_: object) -> None:
 def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
     """Return (L,) log Bayes factors at the null's variances over all scales, and the likeliest scale of each."""
     scales = regime_of(linear).scales
-    at = np.array(list(scales))[:, None, None]
+    at = np.array(list(scales))[:, None, None, None]
     share = np.log(list(scales.values()))
     gains, likeliest = np.zeros((2, len(dictionary.laws)))
-    held = list(dictionary.columns())
-    sums = linear.information([SelectedColumns(columns) for _, _, columns in held])
-    by_size: dict[int, list[tuple[int, Array, Array]]] = {}
-    for (_, index, _), (information, vector) in zip(held, sums, strict=True):
-        for i in index:
-            some = dictionary.laws[i].among
-            by_size.setdefault(len(some), []).append((i, information[some[:, None], some], vector[some]))
-    for sets in by_size.values():
-        k, turned = np.linalg.eigh(np.array([information for _, information, _ in sets]))
-        g = np.einsum("fij,fi->fj", turned, np.array([vector for _, _, vector in sets]))
-        square = at**2 * np.maximum(k, 0.0)
-        evidence = 0.5 * (at**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=2) + share[:, None]
-        index = np.array([i for i, _, _ in sets])
-        gains[index] = logsumexp(evidence, axis=0)
-        likeliest[index] = at[evidence.argmax(axis=0), 0, 0]
+    for place, shapes, index in dictionary.stacks:
+        information, vector = linear.information_of_motions(place.twists, shapes)
+        forms = [dictionary.laws[i] for i in index[0]]
+        for width in {len(form.columns) for form in forms}:
+            numbers = [f for f, form in enumerate(forms) if len(form.columns) == width]
+            among = np.array([forms[f].among for f in numbers])
+            sizes = np.array([forms[f].sizes for f in numbers])
+            per_size = sizes[:, :, None] * sizes[:, None, :]
+            k, turned = np.linalg.eigh(information[:, among[:, :, None], among[:, None, :]] * per_size)
+            g = np.einsum("sfij,sfi->sfj", turned, vector[:, among] * sizes)
+            square = at**2 * np.maximum(k, 0.0)
+            evidence = 0.5 * (at**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=3) + share[:, None, None]
+            gains[index[:, numbers]] = logsumexp(evidence, axis=0)
+            likeliest[index[:, numbers]] = at[evidence.argmax(axis=0), 0, 0, 0]
     return gains, likeliest
 
 

@@ -48,6 +48,8 @@ _NEGLIGIBLE_SHARE = 1e-2
 _REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
 # Sets of columns that are held against a model at once: enough for one large product, few for the memory.
 _SETS_AT_ONCE = 16
+# Numbers of the sums of views that are made at once: they stay in the cache.
+_SUMS_AT_ONCE = 200_000
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
 
@@ -334,6 +336,48 @@ class LinearModel:
             ends = np.cumsum([0, *(X.shape[1] for X in portion)])
             for at in map(slice, ends[:-1], ends[1:]):
                 yield white[:, at].T @ white[:, at] - explained[:, at].T @ explained[:, at], vector[at]
+
+    def information_of_motions(self, twists: Array, shapes: Array) -> tuple[Array, Array]:
+        """Return I (S, kR, kR) and v (S, kR) as `information` does, of motions that follow S sets of shapes.
+
+        A column is a motion of the views times a shape, so that its sums are sums over views of the motions' own,
+        each times what the shapes are there: none as long as what was seen is ever made.
+
+        Args:
+            twists: (V, 6, k) of the views about the observation's centre, per unit of each motion.
+            shapes: (S, V, R) factors of the views.
+        """
+        of_views, across, sign, vector = self._sums_of_twists
+        (sets, views, count), k = shapes.shape, twists.shape[2]
+        of_views = (twists.transpose(0, 2, 1) @ of_views @ twists).reshape(views, 1, k * k)
+        information = np.empty((sets, count, k, count, k))
+        portion = max(_SUMS_AT_ONCE // (views * count * k * k), 1)
+        for at in (slice(start, start + portion) for start in range(0, sets, portion)):
+            some = shapes[at]
+            weighted = (some[..., None] * of_views).reshape(len(some), views, -1)
+            sums = (some.transpose(0, 2, 1) @ weighted).reshape(-1, count, count, k, k)
+            information[at] = sums.transpose(0, 1, 3, 2, 4)
+        by_shape = shapes.transpose(0, 2, 1).reshape(-1, views)
+        shared = (by_shape @ (across @ twists).reshape(views, -1)).reshape(sets, count, -1, k)
+        shared = shared.transpose(0, 2, 3, 1).reshape(sets, -1, k * count)
+        seen = (by_shape @ np.einsum("vi,vik->vk", vector, twists)).reshape(sets, count, k)
+        whole = information.transpose(0, 2, 1, 4, 3).reshape(sets, k * count, k * count)
+        return whole + sign * shared.transpose(0, 2, 1) @ shared, seen.transpose(0, 2, 1).reshape(sets, -1)
+
+    @cached_property
+    def _sums_of_twists(self) -> tuple[Array, Array, float, Array]:
+        """Unit twists of the views in sums: each view's own (V, 6, 6), across views the square of (V, r, 6) with its
+        sign, and against what the model leaves (V, 6)."""
+        views, rows = self.measurement.views.count, self.observation.numbers_per_view
+        if rows is None:
+            unit = self.residual(self.observation.from_twists(np.eye(6 * views)))
+            across = unit.reshape(-1, views, 6).transpose(1, 0, 2)
+            return np.zeros((views, 6, 6)), across, 1.0, (unit.T @ self.white_residual).reshape(views, 6)
+        unit = self.whiten(self.observation.from_twists(np.tile(np.eye(6), (views, 1)))).reshape(-1, rows, 6)[:views]
+        turned = unit.transpose(0, 2, 1)
+        across = (turned @ self._explained.reshape(-1, rows, self._explained.shape[1])[:views]).transpose(0, 2, 1)
+        vector = (turned @ self.white_residual.reshape(-1, rows, 1)[:views])[..., 0]
+        return turned @ unit, across, -1.0, vector
 
     @cached_property
     def _own_information(self) -> ModelInformation:
