@@ -18,11 +18,12 @@ _MARK = "var(--best)"
 _SCANNER, _PART = "var(--t0)", "var(--soft)"
 
 
-def machine_svg(run: RunData, errs: str = "") -> str:
+def machine_svg(run: RunData, errs: str = "", centre_of_part: Array | None = None) -> str:
     """Return the machine as SVG; empty where no arm is known.
 
     Args:
         errs: what is marked: joint 5, the scanner's mount, the part, the scanner, the arm; empty for nothing.
+        centre_of_part: (3,) reference frame; None: of the stitched cloud.
     """
     robot, joints = run.session.robot, run.measurement.views.joints
     if robot is None or not joints.shape[1]:
@@ -35,8 +36,9 @@ def machine_svg(run: RunData, errs: str = "") -> str:
     T_scanner = run.T_mount if eye_to_hand else chain[-1] @ run.T_mount
     # The reference frame is the flange's where that carries the part, else the base.
     T_reference = chain[-1] if eye_to_hand else np.eye(4)
-    seen = run.fused.points if run.fused is not None and len(run.fused.points) else None
-    centre = (T_reference @ np.append(np.zeros(3) if seen is None else seen.mean(axis=0), 1.0))[:3]
+    if centre_of_part is None:
+        centre_of_part = run.fused.points.mean(axis=0) if len(run.fused.points) else np.zeros(3)
+    centre = (T_reference @ np.append(centre_of_part, 1.0))[:3]
     joint = re.fullmatch(r"joint (\d+)", errs)
     arm = chain[:, :3, 3]
     moved = None if joint is None else _magnified(run, q, int(joint[1]) - 1, arm)

@@ -151,7 +151,7 @@ def _typed(command: str) -> str:
 def _machine(found: Diagnosis, screen: dict[str, Any], state: RunData) -> str:
     """Return the machine with what errs marked; after an effect was added what it cures."""
     of = screen["why"]["of"] if screen["why"] is not None else ""
-    drawing = machine_svg(state, of)
+    drawing = machine_svg(state, of, found.linear.observation.centre)
     if not drawing:
         return ""
     titles = {"adequate": f"The machine: {of}, in the model", "cannot_tell": f"The machine: {of}, or another part"}

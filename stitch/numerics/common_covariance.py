@@ -82,6 +82,7 @@ class CommonCovariance:
     # What is kept, by the identity of the whole set of columns, which is kept with it.
     _wholes: dict[int, Array] = field(default_factory=dict, repr=False)
     _turned: dict[int, list[Array]] = field(default_factory=dict, repr=False)
+    _sizes: dict[int, int] = field(default_factory=dict, repr=False)  # numbers of each
     _products: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False)
 
     def weights(self, variances: Array) -> PairWeights:
@@ -137,14 +138,14 @@ class CommonCovariance:
         turned = self._turned.pop(id(whole), None) or self._turn(whole)
         self._wholes[id(whole)] = whole
         self._turned[id(whole)] = turned
+        self._sizes[id(whole)] = sum(part.size for part in turned)
         # Those that were asked for last stay. Other threads ask as well.
-        every = list(self._turned.items())
-        excess = sum(part.size for _, parts in every for part in parts) - _KEPT_NUMBERS
-        for key, parts in every[:-1]:
+        excess = sum(self._sizes.copy().values()) - _KEPT_NUMBERS
+        for key in list(self._turned)[:-1]:
             if excess <= 0:
                 break
             self._turned.pop(key, None)
-            excess -= sum(part.size for part in parts)
+            excess -= self._sizes.pop(key, 0)
         return turned
 
     def _turn(self, columns: Array) -> list[Array]:
