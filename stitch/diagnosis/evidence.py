@@ -35,7 +35,7 @@ from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, promising, score
 from stitch.diagnosis.sensitivity import imitated_share
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
+from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, law_of, laws_of_base, rank_laws
 from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -541,6 +541,25 @@ def does_a_joint_turn_back(case: Case, evidence: Evidence) -> Reply | None:
     return Reply(text, changes)
 
 
+def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
+    """Where a joint errs: does the base do as much about the same axis, and follow the same?
+
+    Of an effect with a name only where it follows nothing of the joints, which the base knows nothing of.
+    """
+    if evidence.verdict == "missing_effect" and not evidence.second:
+        named = evidence.named[0]
+        said = [r for r in evidence.laws if named.name in case.dictionary.said_by[law_of(r).key]]
+        of_joints = [r for r in said if not law_of(r).driver.name.startswith("j")][:1]
+        of_base = laws_of_base(case.linear, case.dictionary, of_joints, named.score)
+        return Reply(_names(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
+    if evidence.named or not evidence.told_laws:
+        return None
+    of_base = laws_of_base(case.linear, case.dictionary, evidence.told_laws)
+    laws = {law_of(r).key: r for r in (*evidence.laws, *of_base)}
+    ranked = tuple(sorted(laws.values(), key=lambda r: -r.log_posterior))
+    return Reply(_names(of_base) or "no", {"laws": ranked} if of_base else {})
+
+
 TESTS: tuple[Question, ...] = (
     does_it_hold_elsewhere,
     does_the_scanner_explain_it,
@@ -550,6 +569,7 @@ TESTS: tuple[Question, ...] = (
     does_the_arm_do_what_hangs_at_it,
     is_its_size_believable,
     does_a_joint_turn_back,
+    could_it_be_the_base,
 )
 
 

@@ -263,7 +263,8 @@ def joint_curve_sentence(curve: JointCurve) -> str:
         f"{_place_in_words(curve, i)}"
         for i in curve.extremes
     )
-    return f"Joint {curve.joint} is off by {low}, and by {high}. That is {curve.share:.0%} of its error without a name."
+    place = curve.place[:1].upper() + curve.place[1:]
+    return f"{place} is off by {low}, and by {high}. That is {curve.share:.0%} of its error without a name."
 
 
 def _place_in_words(curve: JointCurve, k: int) -> str:

@@ -61,7 +61,8 @@ _ACROSS = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
 _FALLS = ("along x", "between x and y", "along y", "between y and -x", "along z")
 # What friction holds of the weight, steel on steel.
 _FRICTION = 0.2
-_NOT_LINKS = ("part", "mount", "robot")
+_BODIES = ("part", "mount")
+_NOT_LINKS = (*_BODIES, "robot")
 # A joint that turns less (rad) follows nothing of its own angle.
 _STILL = np.radians(2.0)
 # What is usual of a joint (rad); of a flange `usual_twist` says it.
@@ -107,6 +108,11 @@ class Place:
     units: tuple[str, ...]  # rad, or length_unit
     joint: int | None = None  # counted from 1
     kind: str = "robot"  # place of effects that act there: robot, links, part, mount
+
+    @property
+    def with_base(self) -> bool:
+        """True where the base is told too, since it moves alike."""
+        return "base" in self.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,6 +322,46 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
     return float((1 + as_clear.sum()) / (1 + _DRAWS))
 
 
+def laws_of_base(
+    linear: LinearModel, dictionary: Dictionary, laws: Sequence[Ranked], effect: Score | None = None
+) -> tuple[Ranked, ...]:
+    """Return laws of the base, each as likely as that of a joint among some laws that moves the views alike.
+
+    Args:
+        effect: what the joint does; None: as each law was fitted.
+    """
+    alike = list[Ranked]()
+    for ranked in laws:
+        law, scored = law_of(ranked), effect or ranked.score
+        if law.place.joint is None or law.place.with_base:
+            continue
+        if not base_does_alike(linear, scored.form.columns @ scored.values, law.shapes):
+            continue
+        same = (law.driver.name, law.shape)
+        whole = (
+            x
+            for x in dictionary.laws
+            if x.place.with_base and x.place.kind in _BODIES and x.is_whole and (x.driver.name, x.shape) == same
+        )
+        for of_base in whole:
+            again = _fitted(linear, of_base, linear.null.variances, 1.0)[1]
+            alike.append(replace(ranked, score=again))
+    return tuple(alike)
+
+
+def base_does_alike(linear: LinearModel, numbers: Array, shapes: Array) -> bool:
+    """Return whether a base that follows shapes (V, R) about fixed axes makes reduced observations (n,) as well.
+
+    Both are aliases then, and what it cannot make is too small beside the scatter for odds of 20 to 1.
+    """
+    base = next(moved for name, _, moved in _bodies(linear) if "base" in name)
+    moved = (base[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(base), -1)
+    basis = column_space(linear.residual(linear.observation.from_twists(moved)))
+    white = linear.residual(numbers[:, None])[:, 0]
+    rest = float(np.sum((white - basis @ (basis.T @ white)) ** 2))
+    return rest < min(2 * limits.ODDS, (1 - limits.ALIAS_CORRELATION**2) * float(np.sum(white**2)))
+
+
 def law_of(ranked: Ranked) -> Law:
     """Return the law of a ranked candidate."""
     effect = ranked.score.candidate.effect
@@ -406,25 +452,31 @@ def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
     return gains, likeliest
 
 
-def _places(linear: LinearModel) -> Iterator[Place]:
-    """Give what the reference carries, what stands at the far end of the arm, and the joints."""
+def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
+    """Give what the reference carries and what stands at the far end of the arm: name, kind, and (V, 6, 6) twists of
+    the views per unit of its own about axes that are fixed in it."""
     measurement = linear.measurement
-    capture = measurement.capture
-    centre = linear.observation.centre
-    count = measurement.views.count
-    to_centre = frames.make(np.eye(3), -centre)
-    still = np.broadcast_to(np.eye(4), (count, 4, 4))
-    usual = usual_twist(measurement.length_unit)
-    sizes = np.append(4 * usual, 4 * usual[:3])
-    units = ("rad",) * 3 + (measurement.length_unit,) * 3 + ("rad",) * 3
+    to_centre = frames.make(np.eye(3), -linear.observation.centre)
+    still = np.broadcast_to(np.eye(4), (measurement.views.count, 4, 4))
     if measurement.eye_to_hand:
         names = ("the part on the flange", "the scanner's stand or the base")
     else:
         names = ("the part or the base", "the scanner or its mount")
+    for name, kind, carried in zip(names, _BODIES, (still, measurement.capture.T_reference_mount), strict=True):
+        yield name, kind, frames.adjoint(to_centre @ carried)
+
+
+def _places(linear: LinearModel) -> Iterator[Place]:
+    """Give what the reference carries, what stands at the far end of the arm, and the joints."""
+    measurement = linear.measurement
+    centre = linear.observation.centre
+    count = measurement.views.count
+    usual = usual_twist(measurement.length_unit)
+    sizes = np.append(4 * usual, 4 * usual[:3])
+    units = ("rad",) * 3 + (measurement.length_unit,) * 3 + ("rad",) * 3
     bodies = list[Array]()
     about_centre = np.broadcast_to(np.eye(6)[:, :3], (count, 6, 3))
-    for name, kind, carried in zip(names, ("part", "mount"), (still, capture.T_reference_mount), strict=True):
-        moved = frames.adjoint(to_centre @ carried)
+    for name, kind, moved in _bodies(linear):
         axes = moved[:, :3, :3]
         about = np.concatenate([axes, np.zeros_like(axes)], axis=1) if kind == "mount" else about_centre
         bodies.append(moved.reshape(-1, 6))

@@ -31,6 +31,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.smooth_processes import SmoothProcess, leading_trends, size_process
+from stitch.diagnosis.systematic_laws import base_does_alike
 from stitch.effects.contract import EFFECTS
 from stitch.model.model import term_of
 from stitch.numerics import parameter_selection
@@ -99,6 +100,23 @@ class JointEffect:
     def errors(self) -> SmoothErrors:
         """The errors of its kind, of all joints."""
         return _joint_processes(self.base)[self.follows]
+
+    @property
+    def usual(self) -> float:
+        """The size of which its columns are, rad."""
+        return float(term_of(self.base.measurement, EFFECTS["joint_offset"]).typical[self.joint - 1])
+
+    @cached_property
+    def place(self) -> str:
+        """Joint 2, or the base where that follows the same about the same axis."""
+        kernel = self.errors.kernel_of(self.process)
+        error = _given_views(self, kernel, kernel)[0] / self.usual
+        motions = self.errors.columns[:, self.process].reshape(len(error), 6)
+        turned = self.model.reduce((motions * error[:, None]).reshape(-1, 1))[:, 0]
+        joint = f"joint {self.joint}"
+        in_time = self.follows in (WITH_TIME, TIME_ONLY)
+        alike = in_time and base_does_alike(self.model, turned, error[:, None])
+        return f"{joint}, or the base about the same axis (these views cannot tell)" if alike else joint
 
     @cached_property
     def model(self) -> LinearModel:
@@ -245,6 +263,7 @@ class JointCurve:
     error: Array  # (G,) of the joint that errs, rad
     sigma: Array  # (G,) of `error`, rad
     view_values: Array  # (V,) the covariate in the views
+    place: str  # the joint, and what turns the views alike
     may_follow: tuple[str, ...] = ()  # what these views do not tell apart, the likeliest first
 
     @property
@@ -366,6 +385,7 @@ def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) ->
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),
         view_values=covariate.unit * at,
         may_follow=effect.may_follow,
+        place=effect.place,
     )
 
 
@@ -378,8 +398,7 @@ def _given_views(effect: JointEffect, with_views: Array, prior: Array) -> tuple[
     """
     linear = effect.model
     variance = linear.null.variances[-1]
-    usual = float(term_of(linear.measurement, EFFECTS["joint_offset"]).typical[effect.joint - 1])
     motions = effect.errors.columns[:, effect.process].reshape(-1, 6, 1)
     white = linear.residual(linear.reduce((motions * with_views.T[:, None, :]).reshape(-1, len(with_views))))
     mean = variance * white.T @ linear.white_residual
-    return usual * mean, usual**2 * (variance * prior - variance**2 * white.T @ white)
+    return effect.usual * mean, effect.usual**2 * (variance * prior - variance**2 * white.T @ white)

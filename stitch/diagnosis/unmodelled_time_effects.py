@@ -364,7 +364,7 @@ def _single_error(linear: LinearModel) -> RepeatingError | None:
     errors = list[RepeatingError]()
     effects = significant_joint_effects(linear)
     if effects:
-        which = " or ".join(f"joint {joint}" for joint in sorted(effect.joint for effect in effects))
+        which = " or ".join(effect.place for effect in sorted(effects, key=lambda effect: effect.joint))
         followed = dict.fromkeys(number for effect in effects for number in effect.may_follow)
         # Of functions that nobody knows none is certain to be of the kind that explains most.
         words = f"come from {which} above all, likeliest by {' or '.join(followed)}"

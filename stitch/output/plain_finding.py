@@ -112,7 +112,7 @@ def _error_location(diagnosis: Diagnosis) -> str:
     if diagnosis.laws:
         return f": {' or '.join(law_of(r).words for r in diagnosis.laws)}"
     if diagnosis.curves:
-        joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in diagnosis.curves}))
+        joints = " or ".join(dict.fromkeys(c.place for c in sorted(diagnosis.curves, key=lambda c: c.joint)))
         return f": the error follows {joints}, but no known formula"
     if diagnosis.time_curve is not None:
         return ": the pose errors change over time, but follow no known formula"
@@ -139,7 +139,9 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
         law = law_of(diagnosis.laws[0])
         remedy = f"look for what changes with {plain_covariate(law.driver.name)} at {law.place.name}"
     elif diagnosis.verdict == "unknown_effect" and diagnosis.curves:
-        remedy = f"have joint {diagnosis.curves[0].joint} checked: gear, bearing, and what hangs on it"
+        curve = diagnosis.curves[0]
+        beside = ", and what the base stands on" if "base" in curve.place else ""
+        remedy = f"have joint {curve.joint} checked: gear, bearing, and what hangs on it{beside}"
     elif diagnosis.verdict == "unknown_effect":
         follows = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
         remedy = f"look for what changes with {follows[0]}" if follows else ""

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_synth.fixtures import labelled_arm
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of, candidates_of
-from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
 from stitch.diagnosis.evidence import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
@@ -67,6 +68,20 @@ def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, w
     value, sigma, _ = law_size(linear, found[0])
     moved = np.ptp(law.shapes, axis=0).max() * size.max()
     assert abs(value - moved) < 4 * sigma + (0.3 if law.place.joint is None else 0.0) * moved
+
+
+@pytest.mark.parametrize(("still", "verdict"), [(True, "cannot_tell"), (False, "missing_effect")])
+def test_a_base_that_steps_about_the_axis_of_joint_2_is_said_beside_the_joint(monkeypatch, still, verdict):
+    """With joint 1 at rest the axis stands still in the base: both motions are one. Where it turns they are two."""
+    drawn = labelled_arm.joints_of
+    monkeypatch.setattr(labelled_arm, "joints_of", lambda rng, views: drawn(rng, views) * [1 - still, 1, 1, 1, 1, 1])
+    errors = np.outer(np.arange(VIEWS) >= 12, [0, 3e-4, 0, 0, 0, 0])
+    state = run(labelled_cell(7, views=VIEWS, errors=(errors, np.zeros((VIEWS, 6))))[0])
+    diagnosis = diagnose_state(state)
+    assert (diagnosis.verdict, diagnosis.effects) == (verdict, ("joint_step",))
+    assert [law_of(r).words for r in diagnosis.laws] == [
+        "the scanner's stand or the base sits displaced from view v12 on"
+    ] * still
 
 
 @pytest.mark.slow

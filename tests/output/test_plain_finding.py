@@ -184,7 +184,7 @@ def test_the_screen_says_how_sure_it_is(found, said):
     ("curves", "said"),
     [
         ((), "look for what changes with the angle of joint 2."),
-        ((SimpleNamespace(joint=5),), "have joint 5 checked: gear, bearing, and what hangs on it."),
+        ((SimpleNamespace(joint=5, place="joint 5"),), "have joint 5 checked: gear, bearing, and what hangs on it."),
     ],
 )
 def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):

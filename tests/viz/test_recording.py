@@ -167,7 +167,7 @@ def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
     session = labelled_cell(3, views=30)[0]
     found = diagnose(run(session))
     angle, error = np.array([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
-    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle)
+    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle, place="joint 2")
     file = RecordingFile("stitch", tmp_path / "d.rrd")
     log_diagnosis(file.stream, replace(found, curves=(course,)), None, session)
     file.write()

@@ -460,7 +460,7 @@ def test_the_scanners_map_is_centred_on_zero_and_empty_without_points(found: Dia
 
 def test_a_joints_course_is_drawn_with_two_sigmas_where_views_stood(found: Diagnosis):
     angle, error = np.array([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
-    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle)
+    course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle, place="joint 2")
     told = diagnosis_plots(replace(found, curves=(course,)), "mm")[0].plots[0]
     band, line, ticks = told["series"]
     assert line["y"] == [-0.1, 0.0, 0.25] and band["sigma"] == [0.01] * 3 and ticks["x"] == [-60.0, 0.0, 40.0]
