@@ -452,8 +452,7 @@ def _check_common_model(
         return _fit_unseen(sessions, measurements, hand_eyes, effects, other)
 
     if len(sessions) > 1 and effects:
-        apart = find_disagreeing_sessions([s.name for s in sessions], screened.fitted, fit_session)
-        doubts = tuple(disagreement.doubt(unit) for disagreement in apart)
+        doubts = find_disagreeing_sessions([s.name for s in sessions], screened.fitted, fit_session, unit)
     if arm:
         holds, sentence = check_arm_transfer(fit_with_arm, arm, screened.fitted, unit)
         if holds:

@@ -9,7 +9,7 @@ squares, of the views' means and of what is left about them. The six numbers and
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,35 +29,7 @@ _SURE_TIMES = 3.0
 _STEPS = 12
 
 
-@dataclass(frozen=True)
-class CommonMove:
-    """From view `start` on the base stands elsewhere."""
-
-    start: int
-    moved: float  # length_unit, rms over what the sensor shows
-    scatter: float  # length_unit, rms of the views
-    T: Array  # (4, 4) of the base
-    T_mount: Array  # (4, 4) T_mount_sensor
-    middles: Array  # (K, 3) of the targets, reference frame
-
-    @property
-    def is_sure(self) -> bool:
-        """False where the arm errs as much."""
-        return self.moved > _SURE_TIMES * self.scatter
-
-    def shows(self, capture: Capture) -> Mask:
-        """Return which views of another capture stand on the moved side."""
-        s = capture.sightings
-        assert s is not None
-        apart = []
-        for T in (np.eye(4), self.T):
-            placed = _placed(capture, self.T_mount, T, s)[1]
-            off = np.linalg.norm(placed - self.middles[s.target], axis=2)
-            apart.append(np.where(s.used, np.nan_to_num(off), 0.0).sum(axis=1))
-        return apart[1] < apart[0]
-
-
-def find_common_move(capture: Capture) -> CommonMove | None:
+def find_common_move(capture: Capture) -> "CommonMove | None":
     """Return the move that the evidence is for; None where there is none or too few views could show it."""
     s = capture.sightings
     assert s is not None
@@ -65,14 +37,14 @@ def find_common_move(capture: Capture) -> CommonMove | None:
     count = len(s.points)
     if count < 2 * _SIDE_VIEWS + 2:
         return None
-    fits = [_MoveFit(capture, T_mount) for T_mount in _starts(capture)]
+    fits = [CommonMove(capture, T_mount) for T_mount in _starts(capture)]
     if not fits:
         return None
     one = min((fit.solved([count]) for fit in fits), key=lambda fit: fit.total)
     starts = list(range(_SIDE_VIEWS, count - _SIDE_VIEWS + 1))
     two = max((fit.solved(starts) for fit in [*fits, one]), key=lambda fit: one.evidence_of(fit))
     price = 6 * np.log(count) + 2 * np.log(len(starts)) + _BELIEVED
-    return two.move() if one.evidence_of(two) > price else None
+    return two if one.evidence_of(two) > price else None
 
 
 def _thinned(s: Sightings) -> Sightings:
@@ -102,7 +74,7 @@ def _placed(capture: Capture, T_mount: Array, T: Array, s: Sightings) -> tuple[A
     return in_base, frames.transform(capture.T_reference_mount, in_base)
 
 
-class _MoveFit:
+class CommonMove:
     """Hand-eye, targets, and a move of the base from a view on, by least squares."""
 
     def __init__(self, capture: Capture, T_mount: Array, T: Array | None = None, start: int | None = None) -> None:
@@ -123,11 +95,36 @@ class _MoveFit:
         """Sum of squares."""
         return float(np.sum(self.rest**2))
 
-    def solved(self, starts: list[int]) -> "_MoveFit":
+    @property
+    def moved(self) -> float:
+        """By how much, rms over what the sensor shows, length_unit."""
+        after = self.in_base[self.view >= self.start]
+        apart = after - frames.transform(frames.inverse(self.T), after)
+        return float(np.sqrt(np.sum(apart**2) / len(apart)))
+
+    @property
+    def is_sure(self) -> bool:
+        """False where the arm errs as much."""
+        return self.moved > _SURE_TIMES * np.sqrt(self.total / len(self.rest))
+
+    def shows(self, capture: Capture) -> Mask:
+        """Return which views of another capture stand on the moved side."""
+        s = capture.sightings
+        assert s is not None
+        middles = np.full((len(s.targets), 3), np.nan)
+        for k in np.unique(self.target):
+            middles[k] = self.placed[self.target == k].mean(axis=0)
+        apart = []
+        for T in (np.eye(4), self.T):
+            off = np.linalg.norm(_placed(capture, self.T_mount, T, s)[1] - middles[s.target], axis=2)
+            apart.append(np.where(s.used, np.nan_to_num(off), 0.0).sum(axis=1))
+        return apart[1] < apart[0]
+
+    def solved(self, starts: list[int]) -> "CommonMove":
         """Return the best of the moves from any of the views, improved until nothing changes."""
         best = self
         for _ in range(_STEPS):
-            tried = [_MoveFit(self.capture, best.T_mount, best.T, start)._stepped() for start in starts]
+            tried = [CommonMove(self.capture, best.T_mount, best.T, start)._stepped() for start in starts]
             nearer = min(tried, key=lambda fit: fit.total)
             if nearer.start == best.start and nearer.total > (1 - 1e-6) * best.total:
                 break
@@ -135,7 +132,7 @@ class _MoveFit:
             best, starts = nearer, [k for k in starts if abs(k - nearer.start) <= 2]
         return best
 
-    def _stepped(self) -> "_MoveFit":
+    def _stepped(self) -> "CommonMove":
         """Return one step of Gauss and Newton."""
         p = self.sightings.points[self.view, self.slot]
         middle = p.mean(axis=0)
@@ -159,7 +156,7 @@ class _MoveFit:
         about, about_base = frames.make(np.eye(3), middle), frames.make(np.eye(3), there)
         T_mount = self.T_mount @ about @ frames.exp(turn * x[:6]) @ frames.inverse(about)
         T = about_base @ frames.exp(turn * x[6:]) @ frames.inverse(about_base) @ self.T
-        return _MoveFit(self.capture, T_mount, T, self.start)
+        return CommonMove(self.capture, T_mount, T, self.start)
 
     def _centred(self, rows: Array) -> Array:
         """Return rows (N, 3, c) less the mean of their target's."""
@@ -177,7 +174,7 @@ class _MoveFit:
         left = self.rest - means[self.view]
         return means, means.T @ means, (left / count[self.view, None]).T @ left
 
-    def evidence_of(self, other: "_MoveFit") -> float:
+    def evidence_of(self, other: "CommonMove") -> float:
         """Return by how much −2 log likelihood falls from this fit to another one."""
         means, *squares = other._view_squares()
         own = self._view_squares()[1:]
@@ -191,14 +188,3 @@ class _MoveFit:
             if np.trace(after) > 0:
                 fall += dimensions * float(np.log(np.trace(before) / np.trace(after)))
         return views * fall
-
-    def move(self) -> CommonMove:
-        """Return the move with its size."""
-        moved = self.view >= self.start
-        before = frames.transform(frames.inverse(self.T), self.in_base[moved])
-        distance = float(np.sqrt(np.mean(np.sum((self.in_base[moved] - before) ** 2, axis=1))))
-        middles = np.full((len(self.sightings.targets), 3), np.nan)
-        for k in np.unique(self.target):
-            middles[k] = self.placed[self.target == k].mean(axis=0)
-        scatter = float(np.sqrt(self.total / len(self.rest)))
-        return CommonMove(self.start, distance, scatter, self.T, self.T_mount, middles)

@@ -6,7 +6,7 @@ what is left is no error of the arm. Hand-eye and targets fitted here say so, wi
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -189,28 +189,11 @@ def view_mean_squares(fitted: FittedRig) -> Array:
     return np.concatenate([own.targets.view_squares for own in fitted.sessions if own.targets is not None])
 
 
-@dataclass(frozen=True)
-class SessionDisagreement:
-    """Rms over the views of one session, length_unit, with the effects of all and with its own."""
-
-    name: str
-    shared_rms: float
-    separate_rms: float
-    expected_rms: float  # of further views, with effects of its own
-    p_value: float  # that effects of its own explain so much by chance
-    large: bool  # sharing costs more than it gives
-
-    def doubt(self, unit: str) -> str:
-        """Return a warning with the size."""
-        rms = (self.shared_rms, self.separate_rms, self.expected_rms)
-        shared, separate, expected = (length_text(x, unit) for x in rms)
-        return sentence("another arm", session=self.name, shared=shared, separate=separate, expected=expected)
-
-
 def find_disagreeing_sessions(
-    names: Sequence[str], fitted: FittedRig, fit_separately: Callable[[int], FittedRig]
-) -> list[SessionDisagreement]:
-    """Find sessions that want effects of their own, beyond chance (F test, Bonferroni over sessions) and by size.
+    names: Sequence[str], fitted: FittedRig, fit_separately: Callable[[int], FittedRig], unit: str
+) -> tuple[str, ...]:
+    """Return a doubt of each session that wants effects of its own, beyond chance (F test, Bonferroni over sessions)
+    and by size: sharing costs more than it gives.
 
     Two arms of one make have the same table and other errors. In one fit with both, what the one does wrong is left in
     the other, and looks like an effect that is missing.
@@ -218,19 +201,22 @@ def find_disagreeing_sessions(
     Args:
         fitted: the fit of all.
         fit_separately: fits the session of that index by itself.
+        unit: of length.
     """
     ends = np.cumsum([session.measurement.views.count for session in fitted.sessions])[:-1]
-    disagreeing = []
+    doubts = []
     for i, (name, shared) in enumerate(zip(names, np.split(view_mean_squares(fitted), ends), strict=True)):
         alone = fit_separately(i)
         numbers = sum(int(np.count_nonzero(term.values)) for term in alone.model_of(0).terms)
-        tested = compare_with_own_effects(name, shared, view_mean_squares(alone), numbers)
-        if tested.large and tested.p_value < _SESSION_CHANCE / len(names):
-            disagreeing.append(tested)
-    return disagreeing
+        rms, p_value, large = compare_with_own_effects(shared, view_mean_squares(alone), numbers)
+        if large and p_value < _SESSION_CHANCE / len(names):
+            texts = (length_text(x, unit) for x in rms)
+            words = dict(zip(("shared", "separate", "expected"), texts, strict=True))
+            doubts.append(sentence("another arm", session=name, **words))
+    return tuple(doubts)
 
 
-def compare_with_own_effects(name: str, shared: Array, separate: Array, numbers: int) -> SessionDisagreement:
+def compare_with_own_effects(shared: Array, separate: Array, numbers: int) -> tuple[list[float], float, bool]:
     """Compare the mean squares of the views (V,) under the effects of all with those under a session's own.
 
     What further views would leave is Akaike's (1970) final prediction error: each parameter that was fitted to these
@@ -238,6 +224,10 @@ def compare_with_own_effects(name: str, shared: Array, separate: Array, numbers:
 
     Args:
         numbers: parameters of the effects that were fitted.
+
+    Returns:
+        Rms with the effects of all, with its own, and of further views with its own, length_unit; the chance that these
+        explain so much; True if sharing costs more than it gives.
     """
     seen = np.isfinite(shared) & np.isfinite(separate)
     views = max(int(seen.sum()), 1)
@@ -245,12 +235,10 @@ def compare_with_own_effects(name: str, shared: Array, separate: Array, numbers:
     own = float(separate[seen].sum())
     count = _NUMBERS_PER_VIEW * views
     left = count - numbers - _NUMBERS_PER_SESSION
-    shared_rms = float(np.sqrt(whole / views))
-    separate_rms = float(np.sqrt(own / views))
+    rms = np.sqrt(np.array([whole, own]) / views).tolist()
     if not numbers or left <= 0:
-        return SessionDisagreement(name, shared_rms, separate_rms, shared_rms, 1.0, False)
+        return [*rms, rms[0]], 1.0, False
     p = f_tail(max((whole - own) / numbers / max(own / left, 1e-300), 0.0), numbers, left)
-    expected_rms = separate_rms * float(np.sqrt((count + numbers) / (count - numbers)))
+    expected = rms[1] * float(np.sqrt((count + numbers) / (count - numbers)))
     uncertain = max(_WORTH_A_TENTH, 2 / np.sqrt(2 * count))
-    large = shared_rms > (1 + uncertain) * expected_rms
-    return SessionDisagreement(name, shared_rms, separate_rms, expected_rms, p, large)
+    return [*rms, expected], p, rms[0] > (1 + uncertain) * expected

@@ -1,6 +1,6 @@
 """Views that do not belong, explained: exchanged rows, a neighbour's joints, a copy, a wrong digit, another part."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,11 @@ from stitch.screening.placement import (
 )
 from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.scan_faults import find_copies, find_same_poses, scale_fault, scan_fault
-from stitch.screening.snooping import MisplacedView, Snooping, end_runs
+from stitch.screening.snooping import MisplacedView, Snooping
 from stitch.session.capture import Capture, part_size
 from stitch.session.robot import forward
 from stitch.session.session import SessionData
 
-# So many views make a step, and this share of those on its side; displacements agree within this share of their size.
-_FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
 # A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
 # (`CLOSE_SHARE` of the part's size).
 _CLOSER_SHARE = 0.2
@@ -69,9 +67,6 @@ def explain_misplaced(
     rest = {v: row for v, row in rows.items() if v in unexplained}
     for v, row in exchanged_pairs(rest, [*unexplained.values()]):
         explain("pair with a silent scan", sorted((v, row)), view=names[v], silent=names[row])
-    moved = None if snooping.steps else find_common_displacement(capture, snooping.expected, [*unexplained.values()])
-    if moved is not None:
-        explain("moved", moved[0], **_between(moved[0], moved[1], names))
     same = find_same_poses(capture)
     out += [_single_view_problem(session, capture, T_mount, snooping, m, same) for m in unexplained.values()]
     for step in snooping.steps:
@@ -134,42 +129,6 @@ def _single_view_problem(
     column, stated, fits, is_neighbours = joint
     mistake = "neighbour's joint" if is_neighbours else "wrong joint"
     return problem(mistake, [name], view=name, joint=column, stated=stated, fits=fits, off=off)
-
-
-def find_common_displacement(
-    capture: Capture, poses: Array, misplaced: Sequence[MisplacedView]
-) -> tuple[range, str] | None:
-    """Find the views at one end of the list that stand off alike, with what moved: part or scanner; None if none do.
-
-    The part was clamped anew, or the scanner moved on its mount.
-
-    Args:
-        poses: (V, 4, 4) T_reference_scanner of the model.
-    """
-    placed = {m.view: m.T for m in misplaced if m.T is not None}
-    runs = end_runs({m.view for m in misplaced}, len(poses))
-    for views in (run for run in runs if len(run) >= _FEWEST):
-        of_run = {v: placed[v] for v in views if v in placed}
-        for moved in ("part", "scanner"):
-            sharing = _count_sharing_displacement(capture, poses, of_run, moved)
-            if sharing >= _FEWEST and sharing >= _SHARE * len(views):
-                return views, moved
-    return None
-
-
-def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[int, Array], moved: str) -> int:
-    """Count the views that share one displacement, at most: a left twist of the part or a right one of the scanner."""
-    best = 0
-    for v, T in placed.items():
-        back = frames.inverse(poses[v])
-        sharing = 0
-        for w, there in placed.items():
-            expected = T @ back @ poses[w] if moved == "part" else poses[w] @ back @ T
-            points = capture.scans[w].points[::_EVERY]
-            stated, fitted, shared = (frames.transform(pose, points) for pose in (poses[w], there, expected))
-            sharing += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
-        best = max(best, sharing)
-    return best
 
 
 def find_wrong_joint(

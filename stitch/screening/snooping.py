@@ -60,20 +60,31 @@ class MisplacedView:
 
 
 @dataclass(frozen=True)
-class Snooping:
+class PlacedViews:
+    """Views where their surfaces put them."""
+
+    unconstrained: UnconstrainedPoses  # with the views where they belong
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    placed: dict[int, Placement]  # views that nothing linked, and where they belong
+    unplaced: list[int]  # views that belong nowhere
+    several: set[int]  # of these, views that close at several places alike
+    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
+    lines: list[int]  # views whose points lie in a line
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
+
+
+@dataclass(frozen=True)
+class Snooping(PlacedViews):
     """What linkage and tests say about the views of one capture."""
 
-    linkage: Linkage  # at the poses that overlaps alone give, from the model's
     misplaced: tuple[MisplacedView, ...]
     suspected: tuple[MisplacedView, ...]  # stand out, but usual effects of the arm would do that too
     steps: tuple[PoseStep, ...]  # from some view on the part or the scanner sits elsewhere
     disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
     model: ViewModel
     blunder_search: BlunderSearch
-    unconstrained: UnconstrainedPoses  # with the views where they belong
     expected: Array  # (V, 4, 4) T_reference_scanner by the robot, steps with it
-    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
-    needed: float  # closure at which a scan counts as placed
     few: FewViews | None = None  # of few views that nothing accuses: against what ordinary arms leave
 
     @property
@@ -111,21 +122,6 @@ class Snooping:
     def translation(self) -> float:
         """The same of translations, length_unit."""
         return float(np.sqrt(self.blunder_search.fit.variances[1]))
-
-
-@dataclass(frozen=True)
-class PlacedViews:
-    """Views where their surfaces put them."""
-
-    unconstrained: UnconstrainedPoses  # with the views where they belong
-    linkage: Linkage  # at the poses that overlaps alone give, from the model's
-    placed: dict[int, Placement]  # views that nothing linked, and where they belong
-    unplaced: list[int]  # views that belong nowhere
-    several: set[int]  # of these, views that close at several places alike
-    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
-    lines: list[int]  # views whose points lie in a line
-    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
-    needed: float  # closure at which a scan counts as placed
 
 
 def snoop_views(
@@ -178,17 +174,14 @@ def snoop_views(
     if usual is not None and _FEWEST <= model.count <= FEW_VIEWS and not accused:
         few = weigh_few_views(usual.measurement, usual.model, located.unconstrained, model)
     return Snooping(
-        linkage=located.linkage,
+        **vars(located),
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
         suspected=tuple(m for m in standing_out if m.view not in sure),
         steps=tests.steps,
         disconnected=tuple(group for group in groups if not set(group) <= {m.view for m in foreign}),
         model=model,
         blunder_search=tests,
-        unconstrained=located.unconstrained,
         expected=expected,
-        tolerance=located.tolerance,
-        needed=located.needed,
         few=few,
     )
 

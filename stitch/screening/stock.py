@@ -355,6 +355,10 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
             break
         if far < _NEAR * scale:
             scale /= 2
+    inside = member & ~edge
+    if kind == "stock" and not w[inside].any():
+        # Nothing of a region is left, or nothing lies as far off as it says.
+        return None
     t = case.twists + x
     held = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
     share = float(scan.area[points].sum() / scan.area.sum())
@@ -362,7 +366,6 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
     np.add.at(of_patches, _patches(scan, index), pulls)
     gain = symmetric_inverse(H)[-1]
     scattered = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
-    inside = member & ~edge
     own = rows[:, 6 * case.view : 6 * case.view + 6]
     over_torn = _over_torn(case, *(column[inside] for column in (own, e, left, weight))) if inside.any() else np.inf
     sigma = float(np.sqrt(max(scattered, gain[-1])))

@@ -15,7 +15,7 @@ from data_synth.fixtures.blade_cells import captured_blade
 from stitch.numerics import frames
 from stitch.screening.linkage import find_contradicting_views, linkage_of_pairs, pair_holds
 from stitch.screening.motions import register_scan_pairs
-from stitch.screening.pairing import exchange_cycles, exchanged_pairs, find_common_displacement
+from stitch.screening.pairing import exchange_cycles, exchanged_pairs
 from stitch.screening.placement import (
     ReferenceSurface,
     closed_placements,
@@ -31,7 +31,6 @@ from stitch.session.scan import prepare_scan
 GATE, OFF = 2.5, 6
 POSES = np.tile(np.eye(4), (3, 1, 1))
 TOLERANCE, SIZE = 0.1, 100.0
-SLIP = np.array([0.05, -0.03, 0.02, 3.0, -5.0, 2.0])
 NAMES = [f"v{v:03d}" for v in range(104)]
 PART_SIZE = 120.0
 PLACES_SLIP = np.array([0.004, -0.003, 0.005, 2.0, -2.0, 1.0])
@@ -170,35 +169,6 @@ def test_groups_that_stand_apart_do_not_contradict_each_other():
     poses[2] = frames.exp(np.array([0, 0, 0, 0, 0, 3.0]))
     assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE) == (2,)
     assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE, groups=[(0, 1), (2,)]) == ()
-
-
-def standing(view, T):
-    return MisplacedView(view, "displaced", 0.1, 5.0, T)
-
-
-@pytest.mark.parametrize("views", [range(2, 5), range(3)])
-@pytest.mark.parametrize("what", ["part", "scanner"])
-def test_a_common_displacement_is_one_step(blade_capture, what, views):
-    measured, capture = blade_capture
-    poses = capture.poses(measured.T_mount)
-    moved = {v: frames.exp(SLIP) @ poses[v] if what == "part" else poses[v] @ frames.exp(SLIP) for v in views}
-    assert find_common_displacement(capture, poses, [standing(v, T) for v, T in moved.items()]) == (views, what)
-
-
-def test_views_that_go_each_its_own_way_are_no_step(blade_capture):
-    measured, capture = blade_capture
-    poses, rng = capture.poses(measured.T_mount), np.random.default_rng(1)
-    own = [standing(v, frames.exp(rng.normal(0, [0.05] * 3 + [5.0] * 3)) @ poses[v]) for v in (2, 3, 4)]
-    assert find_common_displacement(capture, poses, own) is None
-
-
-def test_two_views_or_views_in_the_middle_are_no_step(blade_capture):
-    measured, capture = blade_capture
-    poses = capture.poses(measured.T_mount)
-    for views in ((3, 4), (1, 2, 3)):
-        assert (
-            find_common_displacement(capture, poses, [standing(v, frames.exp(SLIP) @ poses[v]) for v in views]) is None
-        )
 
 
 def misplaced(*views):

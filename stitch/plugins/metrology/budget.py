@@ -286,7 +286,6 @@ class MonteCarlo:
     trials: int
     u: Array  # (Q,) standard deviation of the trials
     propagated: Array  # (Q,) standard uncertainty by the slopes
-    interval: Array  # (Q, 2) that holds 95 % of the trials, less the value
 
     @property
     def ratio(self) -> Array:
@@ -316,9 +315,7 @@ def monte_carlo(
         loadings = _stated_loadings(stated, quantities, values)
         drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
     kept = measured_rows(quantities)
-    drawn, values = drawn[:, kept], values[kept]
-    interval = np.quantile(drawn, [0.025, 0.975], axis=0).T - values[:, None]
-    return MonteCarlo(trials, drawn.std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]), interval)
+    return MonteCarlo(trials, drawn[:, kept].std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]))
 
 
 def _refits(
