@@ -13,7 +13,6 @@ from zlib import crc32
 
 import numpy as np
 
-from bench.drawn_cells import SCENES, hand_eye_chi_square
 from bench.harness import Row, Table, grouped, markdown, share
 from bench.small_cells import (
     HARD,
@@ -21,6 +20,7 @@ from bench.small_cells import (
     LIBRARY,
     OUTSIDE,
     drawn,
+    hand_eye_chi_square,
     hand_eye_error,
     hand_eye_sigma,
     in_session_units,
@@ -29,6 +29,7 @@ from bench.small_cells import (
     user_effect,
 )
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import SMALL_SCENES
 from data_synth.moment import Plan
 from data_synth.simulate import Measured
 from stitch.api.pipeline import change, diagnose, run
@@ -47,7 +48,7 @@ OF_COVARIATES = (*OUTSIDE, "part_growth", "robot_thermal_growth", "scanner_therm
 
 def jobs(seeds: range) -> list[Row]:
     """All trials of all parts in a drawn order; a cell a scene and seed for effects and what is outside the library."""
-    cells = [{"scene": scene, "seed": seed} for seed in seeds for scene in SCENES]
+    cells = [{"scene": scene, "seed": seed} for seed in seeds for scene in SMALL_SCENES]
     todo = list(chain(_effect_jobs(cells), _empty_jobs(), _alias_jobs(), _outside_jobs(cells), _pair_jobs()))
     return [todo[i] for i in np.random.default_rng(0).permutation(len(todo))]
 
@@ -60,7 +61,7 @@ def _effect_jobs(cells: list[Row]) -> Iterator[Row]:
 
 def _empty_jobs() -> Iterator[Row]:
     for i in range(100):
-        scene = SCENES[i % len(SCENES)]
+        scene = SMALL_SCENES[i % len(SMALL_SCENES)]
         yield {"part": "empty", "scene": scene, "seed": 1000 + i, "noise": ""}
         if i % 2:
             yield {"part": "empty", "scene": scene, "seed": 2000 + i, "noise": list(HARD)[i // 2 % len(HARD)]}
@@ -85,7 +86,7 @@ def _pair_jobs() -> Iterator[Row]:
     rng = np.random.default_rng(5)
     for i in range(30):
         two = [str(e) for e in rng.choice(LIBRARY, 2, replace=False)]
-        cell = {"scene": SCENES[i % len(SCENES)], "seed": 5000 + i // 10}
+        cell = {"scene": SMALL_SCENES[i % len(SMALL_SCENES)], "seed": 5000 + i // 10}
         yield {"part": "pairs", **cell, "effects": two, "multiple": 4.0}
 
 

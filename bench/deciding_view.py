@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.drawn_cells import scene_of
 from bench.harness import Row, Table, grouped, markdown, share
 from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.quiet_scenes import plan_for
+from data_synth.fixtures.quiet_scenes import plan_for, small_scene
 from data_synth.moment import Plan
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
@@ -91,7 +90,7 @@ def _deciding(found: Diagnosis, law: str) -> Proposal | None:
 
 
 def _measured(scene: str, hidden: dict[str, float], seed: int, plan: Plan, rail: Array, waits: Array) -> Measured:
-    return simulate(scene_of(scene), hidden, seed, planned=(plan, rail), waits=waits)
+    return simulate(small_scene(scene), hidden, seed, planned=(plan, rail), waits=waits)
 
 
 def _at(plan: Plan, view: int, joints: Array) -> Plan:

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.drawn_cells import SCENES, hand_eye_chi_square, scene_of
 from bench.harness import Row, Table, grouped, markdown, share, with_all
+from bench.small_cells import hand_eye_chi_square
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.quiet_scenes import plan_for
+from data_synth.fixtures.quiet_scenes import SMALL_SCENES, plan_for, small_scene
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import draw_arm
 from data_synth.scene import load_scene
@@ -37,7 +37,7 @@ def jobs(seeds: range) -> Iterator[Row]:
     """A cell a seed: scenes, numbers of views and sizes of the arm in turn."""
     for seed in seeds:
         k = seed - seeds.start
-        yield {"seed": seed, "scene": SCENES[k % 3], "views": VIEWS[k // 3 % 4], "arm": SIZES[k // 12 % 3]}
+        yield {"seed": seed, "scene": SMALL_SCENES[k % 3], "views": VIEWS[k // 3 % 4], "arm": SIZES[k // 12 % 3]}
 
 
 def trial(job: Row) -> Row:
@@ -46,7 +46,7 @@ def trial(job: Row) -> Row:
     rng = np.random.default_rng([seed, 5])
     scene = load_scene(job["scene"])
     plan, rail = plan_for(scene, seed, job["views"])
-    measured = simulate(scene_of(job["scene"]), {}, seed, planned=(plan, rail))
+    measured = simulate(small_scene(job["scene"]), {}, seed, planned=(plan, rail))
     arm = draw_arm(plan.arm.joints, job["arm"], np.random.default_rng([seed, 77]))
     true = on_rail(arm.flange(plan.arm, plan.joints), rail)
     v = int(rng.integers(job["views"]))

@@ -9,10 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.drawn_cells import scene_of
 from bench.harness import ROOT
 from data_synth import kinematics, nature
-from data_synth.fixtures.quiet_scenes import plan_for
+from data_synth.fixtures.quiet_scenes import plan_for, small_scene
 from data_synth.moment import Plan
 from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, simulate
@@ -26,6 +25,7 @@ from stitch.effects.user_file import load
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.run_data import RunData
 from stitch.session.measurement import Measurement
 
 # The beams of brackets are written in other numbers than the library's.
@@ -68,7 +68,7 @@ def measure(
     if alone:
         plan, rail = _last_joint_only(plan, rail)
     planned = (replace(plan, useful=useful or plan.useful), rail)
-    scene = harder(scene_of(name), "" if alone else how, useful)
+    scene = harder(small_scene(name), "" if alone else how, useful)
     return simulate(scene, hidden, seed if chance is None else chance, planned=planned)
 
 
@@ -152,3 +152,9 @@ def _field(measured: Measured) -> Array:
     scanner = measured.scene.scanner
     half = scanner.standoff * np.tan(np.radians(scanner.field_of_view / 4))
     return np.array([[x, y, scanner.standoff] for x in (-half, half) for y in (-half, half)])
+
+
+def hand_eye_chi_square(measured: Measured, state: RunData) -> float:
+    """Return the error of the hand-eye against its covariance; 6 on the average where that is right."""
+    xi = frames.log(frames.inverse(state.T_mount) @ measured.T_mount)
+    return float(xi @ np.linalg.solve(state.mount_covariance, xi))
