@@ -43,7 +43,7 @@ def script_lines(file: Path) -> int:
 
 
 def count() -> dict[str, int]:
-    """Return lines of code by part of the project: core, plugins, and pages with nature (viz, data_synth)."""
+    """Return lines of code by part of the project: core, plugins, pages with nature (viz, data_synth), bench."""
     plugins = ROOT / "stitch" / "plugins"
     files = [file for part in ("stitch", "viz", "data_synth") for file in (ROOT / part).rglob("*.py")]
     stitch = [file for file in files if ROOT / "stitch" in file.parents]
@@ -52,6 +52,7 @@ def count() -> dict[str, int]:
         "core": _sum(file for file in stitch if plugins not in file.parents),
         "plugins": _sum(file for file in stitch if plugins in file.parents),
         "pages_and_nature": _sum(set(files) - set(stitch)) + sum(map(script_lines, scripts)),
+        "bench": _sum((ROOT / "bench").rglob("*.py")),
     }
 
 

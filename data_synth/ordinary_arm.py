@@ -2,7 +2,7 @@
 
 At size 1 every number is normal with the size that a hidden law of one joint has (`nature.py`): offsets of 0.3 mrad,
 first harmonics of 0.3 mrad, lengths of 0.25 mm, twists of 0.3 mrad. What an arm does beside that is here too: pose
-errors that one view hands on to the next, and joints that drag each other.
+errors that one view hands on to the next.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from data_synth import kinematics
 from data_synth.arms import Arm
-from data_synth.moment import Plan
 
 Array = NDArray[np.float64]
 _OFFSET, _WAVE, _LENGTH, _TWIST = 3e-4, 3e-4 / np.sqrt(2), 0.25, 3e-4
@@ -41,14 +40,6 @@ def draw_arm(joints: int, size: float, rng: np.random.Generator) -> OrdinaryArm:
     return OrdinaryArm(
         *(size * unit * rng.standard_normal(joints) for unit in (_OFFSET, _WAVE, _WAVE, _LENGTH, _LENGTH, _TWIST))
     )
-
-
-def coupled(plan: Plan, size: float, rng: np.random.Generator) -> Array:
-    """(V, 4, 4) true flange poses of an arm one of whose joints errs by size·sin q_i·sin 2q_k with another's angle."""
-    i, k = rng.choice(plan.useful, 2, replace=False)
-    error = np.zeros_like(plan.joints)
-    error[:, i] = size * np.sin(plan.joints[:, i]) * np.sin(2 * plan.joints[:, k])
-    return kinematics.flange(plan.arm, plan.joints + error)
 
 
 def with_memory(views: int, correlation: float, rng: np.random.Generator) -> Array:

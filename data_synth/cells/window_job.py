@@ -1,4 +1,4 @@
-"""A window cell's scans as the files that `stitch fit` and `stitch seam` read."""
+"""Stations and robot paths of a window cell as the files that `stitch fit` and `stitch seam` read."""
 
 from pathlib import Path
 
@@ -6,21 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
-from stitch.system.ply_file import write_ply
 
 Array = NDArray[np.float64]
-
-
-def write_scans(table: Path, clouds: list[Array], T_base_scanner: Array) -> None:
-    """One PLY per scan beside the table that names them with their poses."""
-    rows = []
-    for i, (points, T) in enumerate(zip(clouds, T_base_scanner, strict=True)):
-        name = f"{table.stem}-{i + 1:02}.ply"
-        vertex = np.empty(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4")])
-        vertex["x"], vertex["y"], vertex["z"] = points.T
-        write_ply(table.parent / name, {"vertex": vertex})
-        rows.append([name, *pose_numbers(T, 7)])
-    write_rows(table, f"file {POSE}", rows)
 
 
 def write_stations(file: Path, middle: Array, across: Array, outwards: Array) -> None:

@@ -39,9 +39,3 @@ def direction(rng: np.random.Generator) -> Array:
 def standard(course: Array) -> Array:
     """About its mean, of rms 1; 0 where it does not change."""
     return np.asarray((course - course.mean()) / max(float(course.std()), 1e-12))
-
-
-def clock(plan: Plan, time: Array | None) -> tuple[Array, float]:
-    """Steps since the first view, and how many there are."""
-    steps = np.arange(len(plan.joints), dtype=float) if time is None else time - time.min()
-    return steps, float(np.ptp(steps)) + 1.0
