@@ -16,6 +16,7 @@ import stitch
 from bench.harness import Parts, Row, Table, grouped, markdown, share
 from data_synth.cells.axis_cell import AxisCell, axis_cell, write_cell
 from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 
 KINDS = ("turntable", "table-arm", "rail-arm", "tilt-turn")
@@ -96,12 +97,17 @@ def found(job: Row) -> Row:
 
 def cloud_error(cell: AxisCell, poses: Array) -> float:
     """Return the rms distance (µm) of the points of all views from where they are, the cloud put onto the truth."""
-    clouds = [cloud.points[:: max(len(cloud.points) // 300, 1)] for cloud in cell.clouds]
-    put = np.concatenate([frames.transform(T, c) for T, c in zip(poses, clouds, strict=True)])
-    true = np.concatenate([frames.transform(T, c) for T, c in zip(cell.poses, clouds, strict=True)])
-    a, b = put - put.mean(axis=0), true - true.mean(axis=0)
-    R = frames.nearest_rotation(b.T @ a)
-    return float(1e3 * np.sqrt(np.mean(np.sum((a @ R.T - b) ** 2, axis=1))))
+    return float(1e3 * np.sqrt(np.mean(points_off([cloud.points for cloud in cell.clouds], poses, cell.poses) ** 2)))
+
+
+def points_off(clouds: list[Array], poses: Array, true_poses: Array) -> Array:
+    """Return how far some points of all views lie from where they are, the cloud put onto the truth."""
+    some = [points[:: max(len(points) // 300, 1)] for points in clouds]
+    put, true = (
+        np.concatenate([frames.transform(T, c) for T, c in zip(of_views, some, strict=True)])
+        for of_views in (poses, true_poses)
+    )
+    return np.linalg.norm(frames.transform(align_points(put, true), put) - true, axis=1)
 
 
 def named(job: Row) -> Row:

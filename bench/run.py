@@ -42,6 +42,7 @@ TABLES = {
     "measured-sets": "real_arms:MEASURED",
     "mistakes": "integrity:MISTAKES",
     "no-mistake": "integrity:GOOD",
+    "other-programs": "other_programs:TABLE",
     "outside-cells": "outside_cells:TABLE",
     "panel": "panel:TABLE",
     "peers": "speed:PEERS",
