@@ -1,8 +1,8 @@
 """Other programs on the same scans: Open3D's graph of poses, trimesh's ICP, KISS-ICP's odometry of a stream.
 
-Open3D is `stitch compare --with open3d`; trimesh puts each view onto all before it. Both begin at the robot's poses under
-the hand-eye of the run. What counts is how far points lie from where they are, the cloud put onto the truth; the witness
-is right where it calls the program nearer whose points are.
+Open3D is `stitch compare --with open3d`; trimesh puts each view onto all before it. Both begin at the robot's poses
+under the hand-eye of the run. What counts is how far points lie from where they are, the cloud put onto the truth; the
+witness is right where it calls the program nearer whose points are.
 """
 
 import tempfile

@@ -132,10 +132,9 @@ class Room:
         projection = self.json(f"{command} --json")["projection"]
         _, (px, pz), (py, pz2) = projection["offsets"]
         beta, alpha = projection["flange_beta_alpha"]
-        open_planes = sum("open" in plane for plane in projection["likewise"].values())
         return (
-            f"px {px:.4f}, pz {pz:.4f}; py {py:.4f}, pz {pz2:.4f}; the cosine rules are 0/0 in {open_planes} of 2 "
-            f"planes; by the flanges β {beta:.5f}, α {alpha:.5f}"
+            f"px {px:.4f}, pz {pz:.4f}; py {py:.4f}, pz {pz2:.4f}; the source's cosine "
+            f"rules are 0/0 in both; by the flanges β {beta:.5f}, α {alpha:.5f}"
         )
 
     def flange_of_p1(self, command: str) -> str:
@@ -161,13 +160,13 @@ class Room:
         largest = self.json(command)["corrections"]["largest_deviation"]
         return f"{' → '.join(f'{size:.2f}' for size in largest)} mm in {len(largest) - 1} corrections"
 
-    def drill_errors(self, command: str) -> str:
-        truth, places, angles = self.read("drilling.truth.json")["holes"], [], []
+    def drill_errors(self, command: str, what: str, text: str) -> str:
+        truth, errors = self.read("drilling.truth.json")["holes"], []
         for drive in self.json(command)["drives"]:
-            hole = truth[drive["hole"]]
-            places.append(np.linalg.norm(np.subtract(drive["position"], hole["position"])))
-            angles.append(np.degrees(np.arccos(np.clip(np.dot(drive["direction"], hole["direction"]), -1, 1))))
-        return f"position ≤ {max(places):.2f} mm, direction ≤ {max(angles):.2f}°"
+            found, true = (np.array(hole[what]) for hole in (drive, truth[drive["hole"]]))
+            off = np.linalg.norm(found - true)
+            errors.append(off if what == "position" else np.degrees(np.arccos(np.clip(found @ true, -1, 1))))
+        return text.format(max(errors))
 
     def drill_before(self, command: str) -> str:
         return _range([e for group in self.json(command)["groups"].values() for e in group["drive_errors"]], "mm")

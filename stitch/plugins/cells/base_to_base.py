@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from stitch.cli.terminal import say, show_table
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import normal_tail
@@ -134,10 +133,6 @@ def base_document(result: BaseResult) -> dict[str, Any]:
         "T_base1_base2": projection.T_base1_base2.tolist(),
         "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
         "offsets": projection.offsets.tolist(),
-        "likewise": {
-            plane: {"open": angle} if isinstance(angle, str) else {"angle": angle[0], "offsets": angle[1:].tolist()}
-            for plane, angle in projection.likewise.items()
-        },
         "flange_beta_alpha": None if (tilt := projection.flange_beta_alpha) is None else tilt.tolist(),
     }
     return {
@@ -349,52 +344,47 @@ def run_base(file: Path, wanted: Wanted) -> None:
         # The page shows which readings contradict each other.
         write_recording_and_page("base", None, wanted.report, stand, None)
         raise
-    terminal = hand_out(
-        "base", wanted, lambda: [rod_session(stand, result)], lambda: base_document(result), stand, result
-    )
-    if terminal is not None:
-        _print_solution(terminal, result)
+    if hand_out("base", wanted, lambda: [rod_session(stand, result)], lambda: base_document(result), stand, result):
+        _show_solution(result)
 
 
-def _print_solution(terminal: Console, result: BaseResult) -> None:
+def _show_solution(result: BaseResult) -> None:
     unit = result.length_unit
     solution = result.fit
-    headings = ("solution", f"x y z / {unit}", "rotation vector / rad")
-    table = Table(*headings, title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
-    poses = {"least squares": solution.T_base1_base2}
+    rows = [
+        ("least squares", solution.T_base1_base2[:3, 3], frames.log(solution.T_base1_base2)[:3]),
+        ("  1 σ", solution.sigma[3:], solution.sigma[:3]),
+    ]
     if result.projection is not None:
-        poses["projection"] = result.projection.T_base1_base2
-    for name, T in poses.items():
-        table.add_row(name, fixed_digits(T[:3, 3], 5), fixed_digits(frames.log(T)[:3], 6))
-        if name == "least squares":
-            table.add_row("  1 σ", fixed_digits(solution.sigma[3:], 5), fixed_digits(solution.sigma[:3], 6))
-    terminal.print(table)
-    terminal.print(
+        T = result.projection.T_base1_base2
+        rows.append(("projection", T[:3, 3], frames.log(T)[:3]))
+    show_table(
+        "T_base1_base2, translation and turn about the axes of base 1",
+        ("solution", f"x y z / {unit}", "rotation vector / rad"),
+        [(name, fixed_digits(shift, 5), fixed_digits(turn, 6)) for name, shift, turn in rows],
+    )
+    say(
         f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings, p = "
         f"{solution.p_value:.2g}."
     )
     for comparison in result.comparisons:
-        terminal.print(comparison_text(comparison, unit) + ".")
+        say(comparison_text(comparison, unit) + ".")
     for name, angles in result.flange_rpy.items():
-        terminal.print(f"{name}: flange turned by α β γ {fixed_digits(np.array(angles), 4)} rad about x, y, z.")
+        say(f"{name}: flange turned by α β γ {fixed_digits(np.array(angles), 4)} rad about x, y, z.")
     if result.projection is not None:
         for line in _plane_lines(result.projection, unit):
-            terminal.print(line)
+            say(line)
     if result.no_projection:
-        terminal.print(f"No projection: {result.no_projection}.")
+        say(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:
         print(" ".join(f"{value:.9g}" for value in row))
 
 
 def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
-    """Say what the planes beside X-Y show: by our triangle, by the source's rules, by the flanges."""
+    """Say what the planes beside X-Y show, and the flanges."""
     _, beta, alpha = projection.gamma_beta_alpha
-    turns = (("X-Z", "β", beta), ("Y-Z", "α", alpha))
-    for (plane, letter, angle), offsets in zip(turns, projection.offsets[1:], strict=True):
+    for (plane, angle), offsets in zip((("X-Z: β", beta), ("Y-Z: α", alpha)), projection.offsets[1:], strict=True):
         size = "open, taken as level" if np.isnan(angle) else f"{fixed_digits(np.array([angle]), 6)} rad"
-        rules = projection.likewise[plane]
-        if not isinstance(rules, str):
-            rules = f"{letter} {fixed_digits(rules[:1], 6)} rad, {fixed_digits(rules[1:], 5)} {unit}"
-        yield f"{plane}: {letter} {size}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {rules}."
+        yield f"{plane} {size}, {fixed_digits(offsets, 5)} {unit}."
     if projection.flange_beta_alpha is not None:
         yield f"By the pins, upright in their cups: β α {fixed_digits(projection.flange_beta_alpha, 6)} rad."

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
+from stitch.cli.terminal import say, show_table
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -341,28 +341,34 @@ def run_drill(file: Path, servo: str | None, wanted: Wanted) -> None:
         result = make_drives_upright(job, result, servo)
     if wanted.output is not None:
         write_drives(result, wanted.output)
-    terminal = hand_out(
-        "drill", wanted, lambda: [hole_session(job, result)], lambda: drill_document(result), job, result
-    )
-    if terminal is None:
+    if not hand_out("drill", wanted, lambda: [hole_session(job, result)], lambda: drill_document(result), job, result):
         return
     unit = job.length_unit
-    terminal.print(correction_sentence(result, unit))
+    say(correction_sentence(result, unit))
     for line in detail_sentences(result, unit):
-        terminal.print(line)
+        say(line)
     if result.sensors.beams:
-        beams = Table(title="Beams of the range sensors, in the frame of the flange", title_justify="left")
-        for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
-            beams.add_column(heading)
-        for name, beam in result.sensors.beams.items():
-            beams.add_row(name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
-        terminal.print(beams)
-    headings = ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}")
-    table = Table(*headings, title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
-    for drive in result.drives:
-        shift = float(np.linalg.norm(drive.position - drive.hole.position))
-        angles = fixed_digits(np.degrees(drive.angles), 3)
-        table.add_row(drive.hole.name, drive.hole.group, fixed_digits(drive.position, 3), angles, f"{shift:.3f}")
-    terminal.print(table)
+        show_table(
+            "Beams of the range sensors, in the frame of the flange",
+            ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"),
+            [
+                (name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
+                for name, beam in result.sensors.beams.items()
+            ],
+        )
+    show_table(
+        "Drives: T_base_tool, angles about z, y', x''",
+        ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}"),
+        [
+            (
+                drive.hole.name,
+                drive.hole.group,
+                fixed_digits(drive.position, 3),
+                fixed_digits(np.degrees(drive.angles), 3),
+                f"{np.linalg.norm(drive.position - drive.hole.position):.3f}",
+            )
+            for drive in result.drives
+        ],
+    )
     if wanted.output is not None:
         print(wanted.output)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
@@ -29,7 +28,6 @@ from stitch.output.session_files import SessionFiles, TableColumns, write_sessio
 from stitch.session.reading.csv_files import finite_number, read_csv_lines
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
-from stitch.system.process import answer_stream, console
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
 LOWEST_VALUE = 1e-12
@@ -240,14 +238,14 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
 
 def hand_out(
     command: str, wanted: Wanted, sessions: Callable[[], list[SessionFiles]], document: Callable[[], Any], *results: Any
-) -> Console | None:
+) -> bool:
     """Write sessions, recording and page of a command's job and result (`results`), and its JSON, as far as wanted.
 
     Args:
         sessions, document: make the sessions, and the plain data for JSON.
 
     Returns:
-        The terminal for people; None where JSON was wanted alone.
+        Whether people are to read it; JSON was wanted alone where not.
 
     Raises:
         InputError: as `write_recording_and_page`.
@@ -255,10 +253,9 @@ def hand_out(
     if wanted.session is not None:
         write_sessions(wanted.session, sessions())
     write_recording_and_page(command, wanted.recording, wanted.report, *results)
-    if not wanted.as_json:
-        return console(answer_stream())
-    print(json.dumps(document(), indent=1))
-    return None
+    if wanted.as_json:
+        print(json.dumps(document(), indent=1))
+    return not wanted.as_json
 
 
 def fixed_digits(values: Array, digits: int) -> str:

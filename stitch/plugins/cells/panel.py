@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from stitch.cli.terminal import say, show_table
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
@@ -607,66 +606,63 @@ def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
     if wanted.output is not None:
         written = write_folder(job, result, wanted.output) + write_pictures("panel", wanted.output, job, result)
     steps = {"corrections": {"largest_deviation": largest}} if largest else {}
-    terminal = hand_out(
+    if not hand_out(
         "panel", wanted, lambda: robot_sessions(job, result), lambda: panel_document(job, result) | steps, job, result
-    )
-    if terminal is None:
+    ):
         return
-    _print_model(terminal, result)
-    _print_moves(terminal, job, result)
+    _show_model(result)
+    _show_moves(job, result)
     if largest:
         sizes = " → ".join(f"{size:.2f}" for size in largest)
         count = f"{len(largest) - 1} correction{'s' * (len(largest) != 2)}"
-        terminal.print(f"Shape control: {count}, largest deviation {sizes} mm.")
+        say(f"Shape control: {count}, largest deviation {sizes} mm.")
     for name in written:
         print(f"{wanted.output}/{name}")
 
 
-def _print_model(terminal: Console, result: PanelResult) -> None:
-    headings = ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p")
-    table = Table(*headings, title="Robots and tracker in one model: 1 σ of the worst axis", title_justify="left")
+def _show_model(result: PanelResult) -> None:
+    rows = []
     for model in result.models:
         sigma = np.sqrt(np.diag(model.covariance)).reshape(4, 3).max(axis=1)
-        degrees = np.degrees(sigma)
-        cells = (f"{sigma[1]:.3f}", f"{degrees[0]:.4f}", f"{sigma[3]:.3f}", f"{degrees[2]:.4f}", f"{model.p_value:.3g}")
-        table.add_row(model.name, *cells)
-    terminal.print(table)
+        turns = np.degrees(sigma[[0, 2]])
+        sizes = (f"{sigma[1]:.3f}", f"{turns[0]:.4f}", f"{sigma[3]:.3f}", f"{turns[1]:.4f}")
+        rows.append((model.name, *sizes, f"{model.p_value:.3g}"))
+    headings = ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p")
+    show_table("Robots and tracker in one model: 1 σ of the worst axis", headings, rows)
     offsets = [offset for offset in result.legs if offset.detected]
     for offset in offsets:
-        terminal.print(leg_sentence(offset))
+        say(leg_sentence(offset))
     for model in result.models:
         if model.p_value < 1e-4:
             times = np.sqrt(model.chi_square / model.redundancy)
-            terminal.print(
+            say(
                 f"Robot {model.name}: its residuals are {times:.1f} times what the tracker's sigma allows and nothing "
                 "known explains them; look at single rows, or at the robot."
             )
     if result.legs and not offsets:
-        terminal.print("No leg offset beyond chance in any robot.")
+        say("No leg offset beyond chance in any robot.")
 
 
-def _print_moves(terminal: Console, job: PanelJob, result: PanelResult) -> None:
+def _show_moves(job: PanelJob, result: PanelResult) -> None:
     shift = result.shift_errors.position[:, -1].max()
     turn = result.turn_errors.position[:, -1].max()
-    terminal.print(
+    say(
         f"With {job.robots[job.master]} as master, the others are off by {shift:.3f} mm rms at most after a shift by "
         f"100 mm, {turn:.3f} mm after a turn by 2°."
     )
     worst = result.errors_by_master.max(axis=1)
     best = int(np.argmin(worst))
     if worst[best] < 0.9 * worst[job.master]:
-        terminal.print(
-            f"{job.robots[best]} as master would leave {worst[best]:.3f} mm instead of {worst[job.master]:.3f} mm."
-        )
+        say(f"{job.robots[best]} as master would leave {worst[best]:.3f} mm instead of {worst[job.master]:.3f} mm.")
     if result.pose_error is not None:
         x, y, z = result.pose_error[3:]
         a, b, c = np.degrees(result.pose_error[:3])
-        terminal.print(
+        say(
             f"Panel off its target by x {x:+.3f}, y {y:+.3f}, z {z:+.3f} mm, turned about x {a:+.4f}, y {b:+.4f}, "
             f"z {c:+.4f}°, in the panel's frame."
         )
     if (shape := shape_sentence(job, result)) is not None:
-        terminal.print(shape)
+        say(shape)
     if job.forces is not None:
         size = np.linalg.norm(job.forces[:, 3:], axis=1)
-        terminal.print(f"Largest change of force: {size.max():.1f} N at clamp {job.robots[int(np.argmax(size))]}.")
+        say(f"Largest change of force: {size.max():.1f} N at clamp {job.robots[int(np.argmax(size))]}.")

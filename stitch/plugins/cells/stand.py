@@ -12,9 +12,9 @@ plane by the cosine rule, which is here letter for letter but for two misprints:
 of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the source's experiments.
 The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
 
-For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
-where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
-robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
+For X-Z and Y-Z the source says "likewise"; there its rules are 0/0 in its own experiments, where P1 and P2 fall on one
+point of the X-Z plane. So these planes are taken from the vectors R1R2 that rod and second robot give, which is the
+same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
 """
 
 from dataclasses import dataclass, field
@@ -36,9 +36,7 @@ _TOLERANCES = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
 # The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
 # solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
 _GAP = 0.05
-# The same in a plane that T does not take, where other arrangements come near: a millimetre of the rod.
-_CLOSED = 2e-4
-# R1R2 or P1P2 shorter in a plane than this share of its length gives no angle there.
+# R1R2 shorter in a plane than this share of its length gives no angle there.
 _SHORT = 0.05
 _ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
 
@@ -351,8 +349,6 @@ class Projection:
     T_base1_base2: Array  # (4, 4), formula 11
     gamma_beta_alpha: Array  # (3,)
     offsets: Array  # (3, 2): px1, py1; px2, pz1; py2, pz2
-    # By plane, "X-Z" and "Y-Z": β, px2, pz1 and α, py2, pz2 by the rules of the X-Y plane, or why there are none.
-    likewise: dict[str, Array | str]
     flange_beta_alpha: Array | None  # (2,) from pins that stand upright in their cups; None without flange angles
 
 
@@ -368,12 +364,8 @@ def project(stand: Stand) -> Projection:
     T_stand = level_stand(stand.rail.points, stand.rail_slide)
     pivot, *cups = frames.transform(T_stand, np.vstack([[stand.slide[0], 0.0, 0.0], stand.cups]))
     R_base1 = np.array(cups)
-    gamma, p_xy = _cosine_rules(stand, pivot, R_base1, stand.rod.points, (0, 1), stand.turn)
+    gamma, p_xy = _cosine_rules(stand, pivot, R_base1)
     turned = stand.rod.points @ _rotation(2, gamma).T
-    likewise = {
-        "X-Z": _likewise(stand, pivot, R_base1, turned, (2, 0)),
-        "Y-Z": _likewise(stand, pivot, R_base1, turned, (1, 2)),
-    }
     beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
     turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, beta)).T
     alpha, p_zy = _plane(R_base1, turned, (1, 2), 0)
@@ -384,32 +376,7 @@ def project(stand: Stand) -> Projection:
     gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
     if not gap < _GAP * stand.length.max():
         raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; to fix: {_ARRANGEMENT}")
-    return Projection(T, np.array([gamma, beta, alpha]), offsets, likewise, _flange_tilt(stand, gamma))
-
-
-def _likewise(stand: Stand, pivot: Array, R_base1: Array, turned: Array, axes: tuple[int, int]) -> Array | str:
-    """Return angle and both offsets (3,) in X-Z or Y-Z, x or y first, or why there are none.
-
-    Args:
-        turned: R after γ (2, 3).
-    """
-    for name, points in (("P1 and P2", stand.rail.points), ("R1 and R2", R_base1)):
-        apart = points[1] - points[0]
-        if np.linalg.norm(apart[list(axes)]) < _SHORT * np.linalg.norm(apart):
-            return f"{name} fall on one point of this plane, where the cosine rules are 0/0"
-    solutions = []
-    for side in (1.0, -1.0):
-        try:
-            angle, offset = _cosine_rules(stand, pivot, R_base1, turned, axes, side)
-        except NoResultError:
-            continue
-        back = turned[:, axes] @ _rotation(2, angle)[:2, :2].T + offset
-        gap = float(np.abs(back - R_base1[:, axes]).max())
-        solutions.append((gap, np.array([angle, *(offset[::-1] if axes == (2, 0) else offset)])))
-    gap, best = min(solutions, key=lambda pair: pair[0], default=(np.inf, None))
-    if best is not None and gap < _CLOSED * stand.length.max():
-        return best
-    return "the triangles do not close in this plane"
+    return Projection(T, np.array([gamma, beta, alpha]), offsets, _flange_tilt(stand, gamma))
 
 
 def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
@@ -428,22 +395,18 @@ def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
     return np.array([np.arctan2(here[0], here[2]) - np.arctan2(turned[0], turned[2]), alpha])
 
 
-def _cosine_rules(
-    stand: Stand, pivot: Array, R_base1: Array, rod: Array, axes: tuple[int, int], side: float
-) -> tuple[float, Array]:
-    """Return angle and offsets (2,) in the plane of `axes` by formulas 5 to 10 and the cosine rules after them.
+def _cosine_rules(stand: Stand, pivot: Array, R_base1: Array) -> tuple[float, Array]:
+    """Return γ and the offsets (2,) in X-Y by formulas 5 to 10 and the cosine rules after them.
 
-    Written for the source's side: seen against the plane's normal, the rod turns clockwise. With `side` −1 all is
-    mirrored.
+    Written for the source's side: seen from above, the rod turns clockwise. Else all is mirrored.
 
     Args:
         pivot: (3,) of the rod, base 1.
         R_base1: (2, 3) where the rod's cup stood, base 1.
-        rod: (2, 3) the same as the second robot touched it.
     """
-    mirror = np.array([1.0, side])
-    P, R, e, cups = (points[..., list(axes)] * mirror for points in (stand.rail.points, rod, pivot, R_base1))
-    # Formulas 5 to 10 in this plane: the rod's length, and its angle against the rail.
+    mirror = np.array([1.0, stand.turn])
+    P, R, e, cups = (points[..., :2] * mirror for points in (stand.rail.points, stand.rod.points, pivot, R_base1))
+    # Formulas 5 to 10: the rod's length, and its angle against the rail.
     length = np.linalg.norm(cups - e, axis=1)
     theta = _angles_between(P[0] - P[1], cups - e)
     P2e = float(np.linalg.norm(e - P[1]))
@@ -472,7 +435,7 @@ def _cosine_rules(
     O1O2 = _third_side(O2e, O1e, C9)
     C11 = _angle(O1O2, O1e, O2e)
     bearing = sign * (abs(er) - C11)
-    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * side
+    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * stand.turn
     return gamma, O1O2 * np.array([np.cos(bearing), np.sin(bearing)]) * mirror
 
 

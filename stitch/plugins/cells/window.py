@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
+from stitch.cli.terminal import say, show_table
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -446,22 +446,15 @@ def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
     job = replace(read_fit_job(file), allowance_prior=prior)
     parts = [fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
     written = write_fit(job, parts, wanted.output) if wanted.output is not None else []
-    terminal = hand_out(
-        "fit",
-        wanted,
-        lambda: [scan_session(file.stem, job.placed, job.cad_file)],
-        lambda: fit_document(job, parts),
-        job,
-        parts,
-    )
-    if terminal is None:
+    session = [scan_session(file.stem, job.placed, job.cad_file)]
+    if not hand_out("fit", wanted, lambda: session, lambda: fit_document(job, parts), job, parts):
         return
     for i, part in enumerate(parts):
-        terminal.print(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
+        say(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
         for line in detail_sentences(job, part):
-            terminal.print(f"  {line}")
+            say(f"  {line}")
     if job.length_unit is None:
-        terminal.print(NO_UNIT)
+        say(NO_UNIT)
     for name in written:
         print(f"{wanted.output}/{name}")
 
@@ -485,19 +478,17 @@ def run_seam(file: Path, wanted: Wanted) -> None:
     seams = solve_seam(job)
     if wanted.output is not None:
         write_seam(seams, wanted.output)
-    terminal = hand_out(
+    if not hand_out(
         "seam", wanted, lambda: [scan_session(file.stem, job.placed)], lambda: seam_document(seams), job, seams
-    )
-    if terminal is None:
+    ):
         return
-    table = Table("station", "flush / mm", "gap / mm", "verdict", title="Stations, ± 1 σ", title_justify="left")
-    for s in seams:
-        if s.reason:
-            table.add_row(s.station, "", "", f"{s.verdict}: {s.reason}")
-        else:
-            flush, gap = f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}"
-            table.add_row(s.station, flush, gap, s.verdict)
-    terminal.print(stations_sentence(job.limits, seams))
-    terminal.print(table)
+    say(stations_sentence(job.limits, seams))
+    rows = [
+        (s.station, "", "", f"{s.verdict}: {s.reason}")
+        if s.reason
+        else (s.station, f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}", s.verdict)
+        for s in seams
+    ]
+    show_table("Stations, ± 1 σ", ("station", "flush / mm", "gap / mm", "verdict"), rows, ("station", "verdict"))
     if wanted.output is not None:
         print(wanted.output)
