@@ -26,7 +26,7 @@ from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
-from stitch.session.reading.text_files import read_json_object, shortened
+from stitch.session.reading.text_files import shortened
 from stitch.session.scanners import join_sessions
 from stitch.system.packages import arrow_alone, stitch_version
 from stitch.system.ply_file import vertex_columns
@@ -204,7 +204,7 @@ def fused_cloud(path: Path) -> FusedCloud:
     """
     if not path.exists():
         cell = path.parent.parent
-        if "scanners" in (read_json_object(cell / "result.json") if (cell / "result.json").is_file() else {}):
+        if (cell / "result.json").is_file():
             raise InputError(f"{path.parent}: one scanner of {cell}, which has the cloud of all; to fix: name {cell}")
         raise InputError(f"{path}: not kept; to fix: stitch run SESSION -o {path.parent} --force makes it again")
     require_room(path)

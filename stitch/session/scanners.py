@@ -66,16 +66,11 @@ def stops_of(session: SessionData) -> Indices:
     is_in_order = all(view.time_s is not None for view in views)
     stops = list[list[int]]()
     for v, view in enumerate(views):
-        for stop in stops[-1:] if is_in_order else stops:
-            if same[v, stop[0]] and all(views[w].scanner != view.scanner for w in stop):
-                stop.append(v)
-                break
-        else:
-            stops.append([v])
-    of_view = np.zeros(len(views), np.int64)
-    for number, stop in enumerate(stops):
-        of_view[stop] = number
-    return of_view
+        among = stops[-1:] if is_in_order else stops
+        shared = [s for s in among if same[v, s[0]] and all(views[w].scanner != view.scanner for w in s)]
+        stops += [] if shared else [[]]
+        (shared or stops[-1:])[0].append(v)
+    return np.repeat(np.arange(len(stops)), list(map(len, stops)))[np.argsort(np.concatenate(stops))]
 
 
 def scanner_of(session: SessionData, view: View) -> Scanner:

@@ -247,7 +247,7 @@ def sentence(job: PanelJob, result: PanelResult) -> str:
 
 
 def _notes(result: PanelResult) -> list[str]:
-    return [leg_sentence(o) for o in result.legs if o.detected]
+    return [leg_sentence(o) for o in result.legs if o.found]
 
 
 def _tables(job: PanelJob, result: PanelResult) -> list[Table]:

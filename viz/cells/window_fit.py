@@ -150,7 +150,7 @@ def _allowances(parts: list[FittedPart]) -> list[Table]:
         if (found := part.fit.allowance) is not None:
             kind = "varying" if found.prior.varying else "even" if found.prior.free else "stated"
             sizes = (f"{size:+.4f}" for size in (found.value, found.lowest, found.highest))
-            rows.append((str(i + 1), kind, *sizes, f"{found.sigma:.4f}", f"{found.separable_share:.0%}"))
+            rows.append((str(i + 1), kind, *sizes, f"{found.sigma:.4f}", f"{found.told_apart:.0%}"))
     header = ("part", "allowance", "mean", "lowest", "highest", "σ of the mean", "told from a motion")
     return [Table("Allowance: stock outside the CAD is plus", header, rows)] if rows else []
 

@@ -144,15 +144,10 @@ def base_document(result: BaseResult) -> dict[str, Any]:
         "flange_rpy": result.flange_rpy,
         "rail_residuals": solution.rail_residuals.tolist(),
         "rod_residuals": solution.rod_residuals.tolist(),
-        "chi_square": solution.chi_square,
-        "redundancy": solution.redundancy,
-        "p_value": solution.p_value,
+        **{key: getattr(solution, key) for key in ("chi_square", "redundancy", "p_value")},
         "projection": planes,
         "no_projection": result.no_projection,
-        "distances": [
-            {"pair": c.pair, "by_stand": c.by_stand, "by_robot": c.by_robot, "sigma": c.sigma, "sigmas": c.sigmas}
-            for c in result.comparisons
-        ],
+        "distances": [vars(c) | {"sigmas": c.sigmas} for c in result.comparisons],
     }
 
 

@@ -44,9 +44,9 @@ def calibrate_sensors(job: DrillJob) -> FlangeSensors:
     Raises:
         NoResultError: too few or degenerate holes or planes.
     """
-    effects = select_effects(job.checks) if job.checks is not None else None
     beams = {name: fit_ranger(*readings) for name, readings in job.rangers.items()}
-    return FlangeSensors(fit_homography(job.plate_xyz[:, :2], job.plate_uv), effects, beams, job.height)
+    camera = () if job.checks is None else select_effects(job.checks)
+    return FlangeSensors(fit_homography(job.plate_xyz[:, :2], job.plate_uv), beams, job.height, *camera)
 
 
 def drive_onto_references(job: DrillJob, command: str) -> DrillJob:

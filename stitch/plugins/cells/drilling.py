@@ -89,7 +89,11 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
         sensors,
         leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
         groups=groups,
-        drives=tuple(_corrected_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
+        drives=tuple(
+            _corrected_drive(hole, groups[hole.group].T_actual_nominal, tool_axis)
+            for hole in job.holes
+            if not hole.reference
+        ),
         T_measuring_base=base_frame(*job.marker_paths, job.joint6_height) if job.marker_paths else None,
         tool_axis=tool_axis,
         plate=plate_place(job.plate_xyz, job.height, job.locating_rms),
@@ -132,10 +136,11 @@ def _trial_errors(job: DrillJob, sensors: FlangeSensors) -> Iterator[TrialError]
         yield trial_error(trials.texts["hole"][row], stage, sensors.see(ranges, trials.stack("u v")[row]), pin)
 
 
-def _corrected_drive(hole: Hole, group: GroupCompensation, tool_axis: ToolAxis | None) -> Drive:
-    positions, directions = group.apply(hole.position[None], hole.direction[None])
-    R = hole_rotation(directions[0])
-    return Drive(hole, positions[0], directions[0], R if tool_axis is None else tool_axis.orient(R))
+def _corrected_drive(hole: Hole, T_actual_nominal: Array, tool_axis: ToolAxis | None) -> Drive:
+    direction = T_actual_nominal[:3, :3] @ hole.direction
+    R = hole_rotation(direction)
+    position = frames.transform(T_actual_nominal, hole.position)
+    return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
 
 
 def _measured_hole(job: DrillJob, sensors: FlangeSensors, name: str) -> Array:
@@ -197,7 +202,7 @@ def drill_document(result: DrillResult) -> dict[str, Any]:
         },
         "plate": vars(result.plate),
         "trials": [_trial_document(t) for t in result.trials],
-        "camera_effects": result.sensors.effects and [vars(test) for test in _camera_tests(result)],
+        "camera_effects": None if result.sensors.camera is None else list(map(vars, result.sensors.trials)),
     }
 
 
@@ -264,7 +269,7 @@ def _range_text(values: Any) -> str:
 
 def significant_effect_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
     """Say the effects of camera and tool that are taken out."""
-    for trial in _camera_tests(result):
+    for trial in result.sensors.trials:
         if trial.accepted:
             yield f"{_camera_effect_sentence(trial, length_unit)} (1 σ; p = {trial.p_value:.1g}). That is taken out."
     if result.tool_axis is not None and result.tool_axis.accepted:
@@ -274,14 +279,9 @@ def significant_effect_sentences(result: DrillResult, length_unit: str) -> Itera
         )
 
 
-def _camera_tests(result: DrillResult) -> tuple[CameraEffectTest, ...]:
-    effects = result.sensors.effects
-    return effects.trials if effects is not None else ()
-
-
 def _absent_effect_sentences(result: DrillResult) -> Iterator[str]:
     """Say the effects of camera and tool that were looked for in vain."""
-    for trial in _camera_tests(result):
+    for trial in result.sensors.trials:
         if not trial.accepted:
             yield f"{_ABSENT_EFFECTS[trial.effect]} beyond chance (p = {trial.p_value:.1g})."
     if (tool := result.tool_axis) is not None and not tool.accepted:

@@ -9,6 +9,7 @@ hole positions cannot see a tool frame that is turned against the tool; the refe
 the tool upright, so the hole's direction in the reported tool frame is the tool's axis.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -274,16 +275,8 @@ class CameraEffectTest:
     accepted: bool
 
 
-@dataclass(frozen=True)
-class EffectSelection:
-    """The trials in their order and the camera with what was accepted."""
-
-    camera: CameraFit
-    trials: tuple[CameraEffectTest, ...]
-
-
-def select_effects(observations: HoleObservations) -> EffectSelection:
-    """Select among CAMERA_EFFECTS forwards, by F-test and BIC, the best first.
+def select_effects(observations: HoleObservations) -> tuple[CameraFit, list[CameraEffectTest]]:
+    """Return the camera with what is accepted of CAMERA_EFFECTS, forwards by F-test and BIC, and the trials in order.
 
     Raises:
         NoResultError: the observations fix no camera.
@@ -299,7 +292,7 @@ def select_effects(observations: HoleObservations) -> EffectSelection:
             trials += [t for i, t in enumerate(tried) if i != best]
             break
         current = fits[best]
-    return EffectSelection(current, tuple(trials))
+    return current, trials
 
 
 def _test_effect(smaller: CameraFit, bigger: CameraFit) -> CameraEffectTest:
@@ -323,10 +316,6 @@ class GroupCompensation:
     T_actual_nominal: Array  # (4, 4)
     residuals: Array  # (N, 3) actual minus mapped
     errors: Array  # (N, 3) drive errors, actual minus nominal
-
-    def apply(self, positions: Array, directions: Array) -> tuple[Array, Array]:
-        """Return corrected positions and directions (M, 3) of holes of the group."""
-        return frames.transform(self.T_actual_nominal, positions), frames.rotate(self.T_actual_nominal, directions)
 
 
 def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
@@ -562,9 +551,10 @@ class FlangeSensors:
     """Camera and rangers of the flange, calibrated."""
 
     H: Array  # (3, 3) work plane to image
-    effects: EffectSelection | None  # of the camera; None without check holes
     beams: dict[str, RangerFit]
     height: float  # h, of the work plane
+    camera: CameraFit | None = None  # beyond the work plane, where check holes show it
+    trials: Sequence[CameraEffectTest] = ()  # of its effects
 
     def in_plane(self, uv: Array, height: float) -> Array:
         """Return x, y (2,) in the flange frame of a hole that the camera saw at uv (2,).
@@ -573,8 +563,8 @@ class FlangeSensors:
         that were selected; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for
         each mm.
         """
-        if self.effects is not None:
-            return self.effects.camera.plane(uv[None], height)[0]
+        if self.camera is not None:
+            return self.camera.plane(uv[None], height)[0]
         return to_plane(self.H, uv[None])[0]
 
     def see(self, ranges: Array, uv: Array) -> HoleSight:

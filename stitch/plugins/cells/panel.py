@@ -325,7 +325,7 @@ def calibrate_robots(job: PanelJob) -> tuple[tuple[RobotModel, ...], tuple[LegOf
         if job.legs is not None:
             offset = find_leg_offset(readings, model, job.legs, 6 * len(job.robots))
             offsets.append(offset)
-            if offset.detected:
+            if offset.found:
                 real = true_flanges(job.legs, readings.T_base_flange, [(offset.leg, offset.offset)])
                 model = calibrate_robot(replace(readings, T_base_flange=real))
         models.append(model)
@@ -406,7 +406,7 @@ def _flanges_with_offsets(job: PanelJob, offsets: tuple[LegOffset, ...], believe
     """Return where the flanges (N, 4, 4) really are when the controllers believe them at `believed`."""
     real = believed.copy()
     for i, offset in enumerate(offsets):
-        if offset.detected and job.legs is not None:
+        if offset.found and job.legs is not None:
             real[i] = true_flanges(job.legs, believed[i : i + 1], [(offset.leg, sign * offset.offset)])[0]
     return real
 
@@ -415,18 +415,7 @@ def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
     """Return plain data for JSON. mm, degrees, N."""
     document: dict[str, Any] = {
         "robots": {m.name: _robot_document(m) for m in result.models},
-        "leg_offsets": {
-            o.robot: {
-                "found": o.detected,
-                "leg": o.leg,
-                "offset": o.offset,
-                "sigma": o.sigma,
-                "gain": o.chi_square_drop,
-                "runner_up": o.runner_up,
-                "runner_up_gain": o.runner_up_drop,
-            }
-            for o in result.legs
-        },
+        "leg_offsets": {o.robot: {key: value for key, value in vars(o).items() if key != "robot"} for o in result.legs},
         "errors": {
             "after_100_mm": result.shift_errors.position[:, -1].max(axis=0).tolist(),
             "after_2_deg": result.turn_errors.position[:, -1].max(axis=0).tolist(),
@@ -463,9 +452,7 @@ def _robot_document(model: RobotModel) -> dict[str, Any]:
         "sigma_base_deg": np.degrees(sigma[0]).tolist(),
         "sigma_contact": sigma[3].tolist(),
         "sigma_contact_deg": np.degrees(sigma[2]).tolist(),
-        "chi_square": model.chi_square,
-        "redundancy": model.redundancy,
-        "p_value": model.p_value,
+        **{key: getattr(model, key) for key in ("chi_square", "redundancy", "p_value")},
     }
 
 
@@ -501,7 +488,7 @@ def _write_model(file: Path, job: PanelJob, result: PanelResult) -> None:
 
 def leg_sentence(o: LegOffset) -> str:
     """Say which leg's length its controller does not know."""
-    rival = "" if o.chi_square_drop - o.runner_up_drop > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
+    rival = "" if o.gain - o.runner_up_gain > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
     return (
         f"Leg {o.leg} of robot {o.robot} is {o.offset:+.3f} ± {o.sigma:.3f} mm (1 σ) longer than its controller "
         f"believes{rival}. It is taken out of the model and put into the commands."
@@ -629,7 +616,7 @@ def _show_model(result: PanelResult) -> None:
         rows.append((model.name, *sizes, f"{model.p_value:.3g}"))
     headings = ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p")
     show_table("Robots and tracker in one model: 1 σ of the worst axis", headings, rows)
-    offsets = [offset for offset in result.legs if offset.detected]
+    offsets = [offset for offset in result.legs if offset.found]
     for offset in offsets:
         say(leg_sentence(offset))
     for model in result.models:

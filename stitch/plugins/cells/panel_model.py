@@ -337,10 +337,10 @@ class LegOffset:
     leg: int  # from 1
     offset: float  # mm, real length minus the one the controller believes
     sigma: float
-    chi_square_drop: float  # chi-square with one degree of freedom if there is no offset
+    gain: float  # chi-square with one degree of freedom if there is no offset
     runner_up: int  # the leg that explains the data next best
-    runner_up_drop: float
-    detected: bool  # beyond chance
+    runner_up_gain: float
+    found: bool  # beyond chance
 
 
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
@@ -384,10 +384,10 @@ def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, 
         leg=int(best) + 1,
         offset=float(offsets[best]),
         sigma=float(1 / np.sqrt(power[best])),
-        chi_square_drop=float(drops[best]),
+        gain=float(drops[best]),
         runner_up=int(second) + 1,
-        runner_up_drop=float(drops[second]),
-        detected=chi2_tail(drops[best], 1) * tests < _FALSE_ALARM,
+        runner_up_gain=float(drops[second]),
+        found=chi2_tail(drops[best], 1) * tests < _FALSE_ALARM,
     )
 
 

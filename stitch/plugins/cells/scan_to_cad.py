@@ -101,7 +101,7 @@ class Allowance:
     highest: float
     sigma_field: float  # largest 1-sigma at any of those points
     prior: AllowancePrior
-    separable_share: float  # share of it that no motion of the part imitates, 0 to 1; 1 where it was stated
+    told_apart: float  # share of it that no motion of the part imitates, 0 to 1; 1 where it was stated
     coefficients: Array  # (K,) of the columns
     cad: CadSurface
 
@@ -153,9 +153,9 @@ def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
             f", from {allowance.lowest:+.4f} to {allowance.highest:+.4f}{unit} over the scan, each ± "
             f"{allowance.sigma_field:.4f}{unit} at most"
         )
-    if allowance.separable_share < FAINT:
+    if allowance.told_apart < FAINT:
         size += (
-            f"; only {allowance.separable_share:.1%} of it is told from a motion of the part, so that errors of form "
+            f"; only {allowance.told_apart:.1%} of it is told from a motion of the part, so that errors of form "
             "weigh in it"
         )
     return size + "."
@@ -231,7 +231,7 @@ def summarise_allowance(
         highest=float(local.max()),
         sigma_field=float(np.sqrt(np.einsum("ni,ij,nj->n", B, C, B).max())),
         prior=prior,
-        separable_share=separable_share(N) if prior.free else 1.0,
+        told_apart=separable_share(N) if prior.free else 1.0,
         coefficients=coefficients,
         cad=cad,
     )

@@ -301,12 +301,8 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
         "sigma": part.fit.sigma[3:].tolist(),
         "sigma_deg": np.degrees(part.fit.sigma[:3]).tolist(),
         "sigma_parts": {name: np.sqrt(np.diag(C)[3:]).tolist() for name, C in part.fit.parts.items()},
-        "scale": part.fit.scale,
-        "rms": part.fit.rms,
-        "inliers": part.fit.inliers,
-        "points": part.fit.points,
-        "start_share": part.start_share,
-        "start_runner_up": part.start_runner_up,
+        **{key: getattr(part.fit, key) for key in ("scale", "rms", "inliers", "points")},
+        **{key: getattr(part, key) for key in ("start_share", "start_runner_up")},
         "cells": len(cells.mean),
         "cells_outside": int(cells.outside.sum()),
         "worst": worst,
@@ -314,15 +310,9 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
         "points_in_forbidden": part.forbidden,
     }
     if (allowance := part.fit.allowance) is not None:
-        document["allowance"] = {
-            "value": allowance.value,
-            "sigma": allowance.sigma,
-            "kind": "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated",
-            "lowest": allowance.lowest,
-            "highest": allowance.highest,
-            "sigma_field": allowance.sigma_field,
-            "told_apart": allowance.separable_share,
-        }
+        kind = "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated"
+        numbers = ("value", "sigma", "lowest", "highest", "sigma_field", "told_apart")
+        document["allowance"] = {"kind": kind} | {key: getattr(allowance, key) for key in numbers}
     return document
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,8 +16,9 @@ from stitch.errors import InputError
 from stitch.plugins.export.formats import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from stitch.numerics.frames import Array
-    from stitch.plugins.export.robot_program import CompensatedProgram
     from stitch.plugins.intake.controllers.program import Program
     from stitch.plugins.metrology.calibrate.arm_model import ArmModel
 
@@ -200,7 +201,7 @@ def _export_program(
     as_json: bool,
 ) -> None:
     """Write a compensated copy of a robot program, and print the table of its moves."""
-    from stitch.output.json_file import to_json
+    from stitch.numerics.units import length_text
     from stitch.plugins.export.robot_program import compensated_program
     from stitch.plugins.intake.controllers.program import read_program
 
@@ -209,60 +210,44 @@ def _export_program(
     program = read_program(file, frame, tool)
     copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
     places = _write_program(program, copy.texts, output)
+    rows = copy.rows()
     if as_json:
-        document = {
-            "format": "stitch-program/1",
-            "program": str(copy.program.file),
-            "controller": copy.program.controller,
+        of_arm = {
             "session": copy.arm.session,
             "effects": [term.name for term in copy.arm.terms],
             "not_compensated": list(copy.beyond),
             "limit_mm": limit,
-            "targets": copy.rows(),
-            "notes": list(copy.notes),
-            "files": [str(place) for place in places],
         }
-        emit(to_json(document))
-    else:
-        _show_moves(copy, places)
+        _emit_program(program, of_arm, rows, copy.notes, places)
+        return
+    far = max(rows, key=lambda row: row["moved_mm"])
+    left = max(row["left_mm"] for row in rows)
+    remains = f"up to {length_text(left, 'mm')} remain" if left > _NEGLIGIBLE_MOVE else "nothing remains"
+    say(
+        f"{far['target']} moves farthest, by {length_text(far['moved_mm'], 'mm')}, to undo "
+        f"{', '.join(term.name for term in copy.arm.terms)}. Under the model {remains}.",
+        bold=True,
+    )
+    _show_moves(program, rows, copy.notes, places)
 
 
 def _export_moved_program(
     file: Path, fit: Path, output: Path | None, frame: str | None, *, part: int, as_json: bool
 ) -> None:
     """Write a copy of a program that follows a part to where `stitch fit` found it; print the table of its moves."""
-    from stitch.numerics.units import angle_text, length_text
-    from stitch.output.json_file import to_json
-    from stitch.plugins.export.robot_program import moved_program, part_motion
+    from stitch.plugins.export.robot_program import moved_program, part_motion, unread_motions
     from stitch.plugins.intake.controllers.program import read_program
 
     T_base = part_motion(fit, part)
     program = read_program(file, frame, any_tool=True)
     texts, rows = moved_program(program, T_base)
     places = _write_program(program, texts, output)
+    notes = unread_motions(program)
     if as_json:
-        head = {"format": "stitch-program/1", "program": str(file), "controller": program.controller}
-        emit(to_json(head | {"targets": rows, "files": [str(place) for place in places]}))
+        _emit_program(program, {}, rows, notes, places)
         return
     say(f"Moved with the part to where it was found: {len(rows)} of the program's targets.", bold=True)
-    show_table(
-        f"{file.name}: targets moved",
-        ("target", "line", "moved", "turned"),
-        [
-            (
-                row["target"],
-                str(row["line"]),
-                length_text(row["moved_mm"], "mm", 4),
-                angle_text(row["moved_mrad"] / 1e3),
-            )
-            for row in rows[:_LISTED_TARGETS]
-        ],
-    )
-    if program.unread:
-        lines = ", ".join(map(str, program.unread))
-        say(f"Not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}.")
-    for place in places:
-        say(f"  {place}")
+    _show_moves(program, rows, notes, places)
 
 
 def _write_program(program: Program, texts: dict[Path, str], output: Path | None) -> list[Path]:
@@ -312,35 +297,31 @@ def _is_j3_coupled(program: Program, j3: str | None) -> bool:
     return program.controller == "fanuc" and j3 == "j2+j3"
 
 
-def _show_moves(copy: CompensatedProgram, places: list[Path]) -> None:
+def _emit_program(
+    program: Program, of_arm: dict[str, Any], rows: list[dict[str, Any]], notes: Sequence[str], places: list[Path]
+) -> None:
+    """Print a copy of a program as JSON."""
+    from stitch.output.json_file import to_json
+
+    head = {"format": "stitch-program/1", "program": str(program.file), "controller": program.controller}
+    emit(to_json(head | of_arm | {"targets": rows, "notes": list(notes), "files": list(map(str, places))}))
+
+
+def _show_moves(program: Program, rows: list[dict[str, Any]], notes: Sequence[str], places: list[Path]) -> None:
+    """Print the table of the moves of a copy's targets."""
     from stitch.numerics.units import angle_text, length_text
 
-    rows = copy.rows()
-    far = max(rows, key=lambda row: row["moved_mm"])
-    left = max(row["left_mm"] for row in rows)
-    remains = f"up to {length_text(left, 'mm')} remain" if left > _NEGLIGIBLE_MOVE else "nothing remains"
-    say(
-        f"{far['target']} moves farthest, by {length_text(far['moved_mm'], 'mm')}, to undo "
-        f"{', '.join(term.name for term in copy.arm.terms)}. Under the model {remains}.",
-        bold=True,
-    )
-    show_table(
-        f"{copy.program.file.name}: targets moved",
-        ("target", "line", "moved", "U (k = 2)", "turned"),
-        [
-            (
-                row["target"],
-                str(row["line"]),
-                length_text(row["moved_mm"], "mm", 4, zeros=True),
-                length_text(row["U_mm"], "mm", zeros=True),
-                angle_text(row["moved_mrad"] / 1e3),
-            )
-            for row in rows[:_LISTED_TARGETS]
-        ],
-    )
+    has_U = "U_mm" in rows[0]
+    shown = []
+    for row in rows[:_LISTED_TARGETS]:
+        U = (length_text(row["U_mm"], "mm", zeros=True),) if has_U else ()
+        moved = length_text(row["moved_mm"], "mm", 4, zeros=True)
+        shown.append((row["target"], str(row["line"]), moved, *U, angle_text(row["moved_mrad"] / 1e3)))
+    headings = ("target", "line", "moved", *("U (k = 2)",) * has_U, "turned")
+    show_table(f"{program.file.name}: targets moved", headings, shown)
     if len(rows) > _LISTED_TARGETS:
         say(f"{len(rows) - _LISTED_TARGETS} more; --json has all.")
-    for note in copy.notes:
+    for note in notes:
         say(f"{note[0].upper()}{note[1:]}.")
     for place in places:
         say(f"  {place}")

@@ -172,14 +172,15 @@ def program_targets(
     starts = arm.joints[:: max(1, len(arm.joints) // _STARTS)] if near is None else near[None]
     joints: list[Array] = []
     for point in program.points:
-        if point.joints is None and point.T_frame_tool is not None:
+        T = None
+        if point.T_frame_tool is not None:
             T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
+        if point.joints is None and T is not None:
             joints.append(_nearest_solution(program, arm, point, T, joints[-1] if joints else None, starts))
             continue
         joints.append(_taught_joints(program, arm, point, j2_in_j3))
-        if point.T_frame_tool is None:
+        if T is None:
             continue
-        T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
         off = kinematics.forward(arm.robot, joints[-1])[:3, 3] - T[:3, 3]
         metres = float(np.linalg.norm(off)) * arm.robot.metres_per_unit
         if metres > _AGREE:
@@ -426,6 +427,13 @@ def _require_believable(program: Program, sizes: Array, turned: Array, limit: fl
             )
 
 
+def unread_motions(program: Program) -> list[str]:
+    """Return a note of the lines whose motions stay as they are; none where all are read."""
+    lines = ", ".join(map(str, program.unread))
+    note = f"not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}"
+    return [note] if lines else []
+
+
 def _program_notes(
     program: Program, arm: ArmModel, meant: Array, joints: Array, beyond: tuple[str, ...]
 ) -> tuple[str, ...]:
@@ -434,9 +442,7 @@ def _program_notes(
         notes.append(f"not compensated, since it hangs on time, speed or temperature: {', '.join(beyond)}")
     if arm.other_effects:
         notes.append(f"not in a program's targets: {', '.join(arm.other_effects)}")
-    if program.unread:
-        lines = ", ".join(str(line) for line in program.unread)
-        notes.append(f"not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}")
+    notes += unread_motions(program)
     if program.other:
         notes.append(f"no targets of a motion, left as they are: {', '.join(program.other)}")
     sided = [term.name for term in arm.terms if term.name in _HISTORY_EFFECTS]

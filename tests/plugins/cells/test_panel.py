@@ -158,7 +158,7 @@ def test_hidden_leg_offset_is_found_in_its_robot_only():
     hidden[2, 3] = 0.5
     _, readings = measured(11, hidden=hidden, leg=0.004)
     found = [find_leg_offset(r, calibrate_robot(r), LEGS, 36) for r in readings]
-    assert [f.detected for f in found] == [False, False, True, False, False, False]
+    assert [f.found for f in found] == [False, False, True, False, False, False]
     assert found[2].leg == 4
     assert abs(found[2].offset - 0.5) < 4 * found[2].sigma < 0.2
 

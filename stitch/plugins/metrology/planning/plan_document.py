@@ -46,7 +46,6 @@ def _hand_eye(expected: ExpectedHandEye, T_mount: Array) -> dict[str, Any]:
 
 
 def _effect(e: EffectOutlook) -> dict[str, Any]:
-    chance = e.chance
     return {
         "effect": e.name,
         "observable": e.observable,
@@ -54,10 +53,8 @@ def _effect(e: EffectOutlook) -> dict[str, Any]:
         "minimum_detectable": {
             name: {"size": size, "usual": e.usual[name], "unit": e.units[name]} for name, size in e.detectable.items()
         },
-        "chance_detected": None if chance is None else chance.detected,
-        "chance_named": None if chance is None else chance.named,
-        "chance_misnamed": None if chance is None else chance.misnamed,
-        "taken_for": None if chance is None else chance.taken_for,
+        **{f"chance_{key}": getattr(e.chance, key, None) for key in ("detected", "named", "misnamed")},
+        "taken_for": getattr(e.chance, "taken_for", None),
     }
 
 
