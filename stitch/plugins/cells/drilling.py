@@ -137,9 +137,9 @@ def _trial_errors(job: DrillJob, sensors: FlangeSensors) -> Iterator[TrialError]
 
 
 def _corrected_drive(hole: Hole, T_actual_nominal: Array, tool_axis: ToolAxis | None) -> Drive:
-    direction = T_actual_nominal[:3, :3] @ hole.direction
+    direction = frames.rotate(T_actual_nominal, hole.direction[None])[0]
     R = hole_rotation(direction)
-    position = frames.transform(T_actual_nominal, hole.position)
+    position = frames.transform(T_actual_nominal, hole.position[None])[0]
     return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
 
 

@@ -117,7 +117,7 @@ def test_surface_of_a_tilted_plane():
     normal = Rotation.from_euler("xy", [0.03, -0.05]).apply([0.0, 0, 1])
     d = ((np.array([0, 0, 186.0]) - origins) @ normal) / (directions @ normal)
     beams = {f"L{i}": RangerFit(*beam, rms=0.0) for i, beam in enumerate(zip(origins, directions, strict=True))}
-    sight = FlangeSensors(np.eye(3), None, beams, 180.0).see(d, np.zeros(2))
+    sight = FlangeSensors(np.eye(3), beams, 180.0).see(d, np.zeros(2))
     assert sight.offset[2] == pytest.approx(6, abs=1e-9)
     assert sight.tilt == pytest.approx(np.arccos(np.cos(0.03) * np.cos(0.05)), abs=1e-9)
 
@@ -182,7 +182,7 @@ def test_upright_turns_the_axis_onto_the_normal():
 def ideal_sensors():
     origins = np.array([[30.0, 0, 100], [0, 30, 100], [-30, -30, 100]])
     beams = {f"L{i}": RangerFit(origin, np.array([0.0, 0, 1]), rms=0.0) for i, origin in enumerate(origins)}
-    return FlangeSensors(np.diag([20.0, 20.0, 1.0]), None, beams, 186.0)
+    return FlangeSensors(np.diag([20.0, 20.0, 1.0]), beams, 186.0)
 
 
 def test_servo_ends_within_the_three_thresholds():
@@ -285,7 +285,7 @@ def experiment(seed):
     xyz, uv = cell.plate()
     planes, readings = cell.plane_readings()
     beams = {f"L{i + 1}": fit_ranger(planes, row) for i, row in enumerate(readings)}
-    sensors = FlangeSensors(fit_homography(xyz[:, :2], uv), None, beams, HEIGHT)
+    sensors = FlangeSensors(fit_homography(xyz[:, :2], uv), beams, HEIGHT)
 
     def looker(name):
         return lambda T_base_tool: sensors.see(*cell.measure(name, T_base_tool))
@@ -298,8 +298,10 @@ def experiment(seed):
             T_base_tool, sight, _ = servo_to_hole(looker(name), drive_pose(*cell.nominal[name]))
             actual.append(sight.hole(T_base_tool))
         compensation = compensate_group(np.array([cell.nominal[name][0] for name in references]), np.array(actual))
-        drawn = (np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1))
-        for name, position, direction in zip(targets, *compensation.apply(*drawn), strict=True):
+        positions, directions = (np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1))
+        T = compensation.T_actual_nominal
+        placed = frames.transform(T, positions), frames.rotate(T, directions)
+        for name, position, direction in zip(targets, *placed, strict=True):
             after.append(cell.errors(name, turn_upright(looker(name), drive_pose(position, direction))))
     return np.array(before), np.array(after)
 
