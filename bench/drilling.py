@@ -12,6 +12,7 @@ import numpy as np
 from bench.harness import Parts, Row, Table, markdown
 from data_synth.cells.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import render_plate
+from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.cells.drill_servo import drive_pose, servo_to_hole, turn_upright
 from stitch.plugins.cells.drilling_sensors import (
@@ -51,7 +52,7 @@ def calibrated_sensors(cell: DrillingCell) -> tuple[FlangeSensors, Array, Array]
     xyz, uv = cell.plate()
     planes, readings = cell.plane_readings()
     beams = {f"L{i + 1}": fit_ranger(planes, row) for i, row in enumerate(readings)}
-    return FlangeSensors(fit_homography(xyz[:, :2], uv), None, beams, HEIGHT), xyz, uv
+    return FlangeSensors(fit_homography(xyz[:, :2], uv), beams, HEIGHT), xyz, uv
 
 
 def run_group(
@@ -67,8 +68,9 @@ def run_group(
         T_base_tool, sight, count = servo_to_hole(_looker(cell, sensors, name), drive_pose(*cell.nominal[name]))
         moves.append(count)
         actual.append(sight.hole(T_base_tool))
-    compensation = compensate_group(np.array([cell.nominal[name][0] for name in references]), np.array(actual))
-    positions, directions = compensation.apply(*(np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1)))
+    T = compensate_group(np.array([cell.nominal[name][0] for name in references]), np.array(actual)).T_actual_nominal
+    positions, directions = (np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1))
+    positions, directions = frames.transform(T, positions), frames.rotate(T, directions)
     drives = {
         name: turn_upright(_looker(cell, sensors, name), drive_pose(position, direction))
         for name, position, direction in zip(targets, positions, directions, strict=True)
@@ -110,10 +112,10 @@ def _hidden(job: Row) -> Row:
     cell = DrillingCell(job["seed"], Sizes(k1=job["k1"], plate_height=job["plate"]))
     (xyz, uv), (at, image) = cell.plate(), cell.check_holes()
     on_plate = np.arange(len(xyz) + len(at)) < len(xyz)
-    selected = select_effects(HoleObservations(np.vstack([xyz, at]), np.vstack([uv, image]), on_plate, IMAGE))
-    named = {t.effect: float(t.value) for t in selected.trials if t.accepted}
+    camera, trials = select_effects(HoleObservations(np.vstack([xyz, at]), np.vstack([uv, image]), on_plate, IMAGE))
+    named = {t.effect: float(t.value) for t in trials if t.accepted}
     at, image = cell.check_holes((0.0,))
-    places = [to_plane(fit_homography(xyz[:, :2], uv), image), selected.camera.plane(image, at[:, 2])]
+    places = [to_plane(fit_homography(xyz[:, :2], uv), image), camera.plane(image, at[:, 2])]
     return {"named": named, "means": [float(np.linalg.norm(p - at[:, :2], axis=1).mean()) for p in places]}
 
 

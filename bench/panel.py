@@ -231,15 +231,15 @@ def _leg(job: Row) -> Row:
         model = calibrate_robot(reading)
         offset = find_leg_offset(reading, model, LEGS, 36)
         if i != 2:
-            wrong += bool(offset.detected)
+            wrong += bool(offset.found)
             continue
         better = model
-        if offset.detected:
+        if offset.found:
             real = true_flanges(LEGS, reading.T_base_flange, [(offset.leg, offset.offset)])
             better = calibrate_robot(replace(reading, T_base_flange=real))
         T_base_world = frames.inverse(cell.T_world_base[2])
         off = [float(np.linalg.norm((T_base_world @ m.T_world_base)[:3, 3])) for m in (model, better)]
-        row = {"found": bool(offset.detected), "right": bool(offset.detected and offset.leg == 4), "base": off}
+        row = {"found": bool(offset.found), "right": bool(offset.found and offset.leg == 4), "base": off}
         row |= {"offset": float(offset.offset), "sigma": float(offset.sigma)}
     return {**row, "wrong": wrong}
 
