@@ -53,7 +53,9 @@ def _effect(e: EffectOutlook) -> dict[str, Any]:
         "minimum_detectable": {
             name: {"size": size, "usual": e.usual[name], "unit": e.units[name]} for name, size in e.detectable.items()
         },
-        **{f"chance_{key}": getattr(e.chance, key, None) for key in ("detected", "named", "misnamed")},
+        "chance_detected": getattr(e.chance, "detected", None),
+        "chance_named": getattr(e.chance, "named", None),
+        "chance_misnamed": getattr(e.chance, "misnamed", None),
         "taken_for": getattr(e.chance, "taken_for", None),
     }
 
