@@ -109,7 +109,7 @@ def _told(found: Diagnosis, law: str) -> str:
     if found.verdict == "missing_effect":
         return "right" if found.effects == (law,) else f"wrong: {found.effects[0]}"
     if found.verdict == "cannot_tell":
-        return f"{'cannot tell' if law in found.effects else 'wrong'}: {' / '.join(found.effects)}"
+        return f"{'cannot tell' if law in found.effects else 'not among'}: {' / '.join(found.effects)}"
     return found.verdict
 
 
@@ -136,7 +136,9 @@ def summary(rows: list[Row]) -> list[str]:
         ],
     )
     without = sum(row["probability"] is None for row in asked)
-    told = f"{len(rows)} cells, {len(asked)} ambiguous; in {without} of them the view was proposed without odds."
+    lost = sum(row[f"after_{MOST_VIEWS}"].startswith("not among") for row in asked)
+    told = f"{len(rows)} cells, {len(asked)} ambiguous; in {without} of them the view was proposed without odds. "
+    told += f"After three views {lost} ended in a group without the true law."
     return [told, "", *lines, "", *_odds([row for row in asked if row["probability"] is not None])]
 
 

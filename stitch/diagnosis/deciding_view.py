@@ -81,7 +81,6 @@ class DecidingViews:
     joints: Array  # (K, n) rad
     wait: Array  # (K,) s after the last view that there is, beside the usual pause
     probability: Array  # (K,) that the true rival is named after the view and those before it
-    wrong: float  # that a wrong one is, after all of them
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def deciding_views(
     scores = [ranked.score for ranked in rivals]
     if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
         return None
-    if not all(scored.fitted for scored in scores):
+    if not scores or not all(scored.fitted for scored in scores):
         return None
     if isinstance(linear.observation, SurfaceObservation) and moves_points([scored.form.term for scored in scores]):
         return None
@@ -138,16 +137,12 @@ def deciding_views(
     if not len(joints):
         return None
     forms = competing_forms(scores, log_weights).beside(unnamed, [ranked.log_belief for ranked in rivals])
-    first = _choose(linear, forms, joints, most)
-    best = joints[np.argsort(-first.single, kind="stable")[:_BEST]]
+    first, single = _choose(linear, forms, joints, most)
+    best = joints[np.argsort(-single, kind="stable")[:_BEST]]
     closer = possible_joints(linear, best)[:_CLOSER]
-    both = np.concatenate([best, joints[first.chosen], closer])
-    choice = _choose(linear, forms, np.unique(both.round(9), axis=0), most)
-    if not choice.chosen:
-        return None
-    return DecidingViews(
-        choice.joints[choice.chosen], choice.wait[choice.chosen], np.array(choice.probability), choice.wrong
-    )
+    both = np.concatenate([best, first.joints, closer])
+    views, _ = _choose(linear, forms, np.unique(both.round(9), axis=0), most)
+    return views if len(views.joints) else None
 
 
 def unnamed_joints(linear: LinearModel, scores: Sequence[Score]) -> list[tuple[JointEffect, float]]:
@@ -213,18 +208,9 @@ def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
     return RivalForms(forms, np.array(weights), np.array(rival), np.zeros(len(scores)), len(scores))
 
 
-@dataclass(frozen=True)
-class _Choice:
-    joints: Array  # (N, n) tried
-    wait: Array  # (N,)
-    single: Array  # (N,) probability of the true rival after each view alone
-    chosen: list[int]
-    probability: list[float]
-    wrong: float
-
-
-def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> _Choice:
-    """Return the views that are chosen one after the other among joints (N, n)."""
+def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> tuple[DecidingViews, Array]:
+    """Return the views that are chosen one after the other among joints (N, n), and (N,) the mean probability of the
+    true rival after each alone."""
     wait = _waits(linear, forms.scores, len(joints))
     predictions = predict_views(linear, forms.scores, joints, wait)
     m = predictions[0].mean.shape[1]
@@ -234,7 +220,7 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) ->
     true_share = float(np.sum((np.bincount(forms.rival, weights) / weights.sum()) ** 2))
     chosen = list[int]()
     probability = list[float]()
-    single, wrong = np.zeros(len(joints)), 0.0
+    single = np.zeros(len(joints))
     while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
         of_true = _decisions(predictions, forms, chosen, every, draws)[2]
@@ -243,13 +229,13 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) ->
             single = of_true
         k = int(of_true.argmax())
         stated = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
-        right, missed, share = _decisions(predictions, forms, chosen, every[k : k + 1], stated)
+        right, _, share = _decisions(predictions, forms, chosen, every[k : k + 1], stated)
         if share[0] < true_share + _WORTH:
             break
         chosen.append(k)
         probability.append(float(right[0]))
-        true_share, wrong = float(share[0]), float(missed[0])
-    return _Choice(joints, wait, single, chosen, probability, wrong)
+        true_share = float(share[0])
+    return DecidingViews(joints[chosen], wait[chosen], np.array(probability)), single
 
 
 def _decisions(
@@ -282,7 +268,8 @@ def _decisions(
         fits = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
         decided = forms.margins(fits) > ODDS
         right += weight * decided[true].mean(axis=1)
-        wrong += weight * np.delete(decided, true, axis=0)[: forms.named].any(axis=0).mean(axis=1)
+        others = [r for r in range(forms.named) if r != true]
+        wrong += weight * decided[others].any(axis=0).mean(axis=1)
         share += weight * np.exp(fits[true] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
     return right, wrong, share
 

@@ -165,12 +165,12 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     contenders = [r for r in evidence.ranked if is_contender(r)]
     if not contenders:
         return Reply("none that could be named", ends=True)
+    first = contenders[0]
+    while hidden := _hidden_contenders(case, contenders):
+        contenders += hidden
     base = _without(case.linear, contenders)
-    hidden = _hidden_contenders(case, base, evidence.ranked)
-    first, contenders = contenders[0], [*contenders, *hidden]
     if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
-        base = _without(case.linear, contenders)
         contenders = [rescored_in(base, r) for r in contenders]
     ranked = _with_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
@@ -198,16 +198,18 @@ def _without(linear: LinearModel, effects: Sequence[Ranked]) -> LinearModel:
     return linear.restricted(linear.causes - {r.name for r in effects})
 
 
-def _hidden_contenders(case: Case, base: LinearModel, ranked: Sequence[Ranked]) -> list[Ranked]:
+def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]:
     """Return effects that could be named only where no contender is among the errors that remain: a base that gives
     way, or an uneven gear, explains nothing beside joints that may give way by as much as the views show."""
+    base = _without(case.linear, contenders)
     if base is case.linear:
         return []
-    weak = [c for c in case.candidates if any(c.name == r.name and not is_contender(r) for r in ranked)]
+    known = {r.name for r in contenders}
+    weak = [c for c in case.candidates if not c.empirical and c.name not in known]
     remaining = [c for c in weak if c.name in base.causes]
     likely = promising(base, [c for c in weak if c not in remaining], limits.CANDIDATES_TRIED)
     tried = [*remaining, *(candidate for candidate, _ in likely)]
-    again = rank(list(parallel(partial(score, base), tried)), len(ranked))[0]
+    again = rank(list(parallel(partial(score, base), tried)), contenders[0].tests)[0]
     return [r for r in again if is_contender(r)]
 
 

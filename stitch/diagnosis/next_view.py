@@ -16,7 +16,6 @@ from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, CLEAR_DEPENDENCE
 from stitch.model.forward import moves_points
 from stitch.numerics.frames import Array
-from stitch.numerics.least_squares import equilibrated
 from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
 from stitch.session.robot import forward
@@ -28,8 +27,6 @@ _TRIED, _LIKELIEST = 250, 6
 _NEAR, _OTHERS = 10.0, 3
 # What the odds of a view are without.
 NOT_IN_ODDS = "The odds do not hold what views left out may say against it."
-# Precision of ten plausible sizes: a rival may take each of its parameters that large.
-RIDGE = 0.01
 
 ARTEFACTS = {
     "range_scale": "scan a sphere or ball bar of known size, or the part's CAD: overlaps alone hardly show a scale",
@@ -88,6 +85,7 @@ def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
         return list(diagnosis.named)
     unmodelled = does_an_unmodelled_effect_explain_it.__name__
     if diagnosis.verdict == "unknown_effect" and any(a.name == unmodelled and a.changed for a in diagnosis.answers):
+        # Beside all errors that remain: laws of no effect, which the odds do not hold, weigh as much.
         return [c.ranked for c in diagnosis.candidates if is_contender(c.ranked)][:_OTHERS]
     fitted = [c.ranked for c in diagnosis.candidates if c.ranked.score.observable and c.ranked.score.fitted]
     likeliest = fitted[:_LIKELIEST]
@@ -174,25 +172,3 @@ def _pose(linear: LinearModel, do: str, names: tuple[str, ...], joints: Array) -
     degrees = [round(float(x), 2) for x in np.degrees(joints)]
     T = forward(linear.measurement.robot, np.radians(degrees))
     return Proposal(do, names, degrees, 1, T_base_flange=T.round(9).tolist())
-
-
-def separations(normal: Array, own: slice, rival: slice) -> Array:
-    """Return (..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being
-    free.
-
-    Args:
-        normal: (..., q, q) normal matrix; columns at plausible sizes.
-        own: of the pattern.
-        rival: of the rival.
-    """
-    q = normal.shape[-1]
-    rest = np.setdiff1d(np.arange(q), np.arange(own.start, own.stop))
-    ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
-    free = normal[..., rest[:, None], rest] + np.diag(ridge)
-    across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
-    same_units, unit = equilibrated(free)
-    inverse = np.linalg.pinv(same_units, rcond=1e-12, hermitian=True)
-    scaled = across * unit[..., :, None]
-    imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
-    left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
-    return np.maximum(left, 0.0)

@@ -19,7 +19,6 @@ import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.next_view import RIDGE
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes
@@ -39,6 +38,7 @@ from stitch.plugins.metrology.planning.expected_model import (
     simulate_views,
     with_scatter,
 )
+from stitch.plugins.metrology.planning.information import RIDGE
 from stitch.session.session import SessionData
 from stitch.system.process import steps
 

@@ -16,7 +16,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import equilibrated
 
+# Precision of ten plausible sizes: a rival may take each of its parameters that large.
+RIDGE = 0.01
 # A direction that a view sees less than this share of its clearest one is as good as unseen.
 _UNSEEN = 1e-6
 
@@ -72,3 +75,25 @@ def noise_of(information: Array, variance: float, lever: float) -> Array:
     each = np.arange(len(values))
     out[each, :, each] = half @ half.transpose(0, 2, 1)
     return out.reshape(6 * len(values), -1)
+
+
+def separations(normal: Array, own: slice, rival: slice) -> Array:
+    """Return (..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being
+    free.
+
+    Args:
+        normal: (..., q, q) normal matrix; columns at plausible sizes.
+        own: of the pattern.
+        rival: of the rival.
+    """
+    q = normal.shape[-1]
+    rest = np.setdiff1d(np.arange(q), np.arange(own.start, own.stop))
+    ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
+    free = normal[..., rest[:, None], rest] + np.diag(ridge)
+    across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
+    same_units, unit = equilibrated(free)
+    inverse = np.linalg.pinv(same_units, rcond=1e-12, hermitian=True)
+    scaled = across * unit[..., :, None]
+    imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
+    left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
+    return np.maximum(left, 0.0)

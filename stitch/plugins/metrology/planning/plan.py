@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.candidates import free_masks
-from stitch.diagnosis.next_view import separations
 from stitch.diagnosis.score import weights_of_masks
 from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.effects.contract import find_effect, require_available
@@ -27,7 +26,7 @@ from stitch.plugins.metrology.planning.expected_model import (
     simulate_views,
     thinned_surface,
 )
-from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
+from stitch.plugins.metrology.planning.information import TwistChannel, noise_of, separations
 from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
 from stitch.session.axis_poses import reported_poses
 from stitch.session.session import SessionData

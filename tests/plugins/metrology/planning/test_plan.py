@@ -17,14 +17,13 @@ from data_synth.write import write_session
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
-from stitch.diagnosis.next_view import separations
 from stitch.diagnosis.score import scatter_limit
 from stitch.effects.contract import EFFECTS
 from stitch.numerics import frames
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.plugins.metrology.planning import plan
 from stitch.plugins.metrology.planning.expected_model import cell_of_session, simulate_views
-from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
+from stitch.plugins.metrology.planning.information import TwistChannel, noise_of, separations
 from stitch.plugins.metrology.planning.plan import (
     KnownPlace,
     PlanRequest,
