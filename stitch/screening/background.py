@@ -179,11 +179,7 @@ def _under_model(
         points = frames.transform(T_w_v, scans[v].points[index])
         normals = frames.rotate(T_w_v, scans[v].normals[index])
         on_part |= points_in_place(scan, points, normals, tolerance)
-        away = np.linalg.norm(points - scan.eye, axis=1)
-        beside, partner = looks[w].query(scan.rays(points), k=1)
-        hit = beside * away < 2 * scan.spacing
-        seen = np.linalg.norm(scan.points[partner.astype(int)] - scan.eye, axis=1)
-        through |= hit & (seen > away + _BEHIND * scan.spacing)
+        through |= _looks_through(scan, looks[w], points, _BEHIND * scan.spacing)
     return on_part, through
 
 

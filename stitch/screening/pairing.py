@@ -71,7 +71,8 @@ def explain_misplaced(
     out += [_single_view_problem(session, capture, T_mount, snooping, m, same) for m in unexplained.values()]
     for step in snooping.steps:
         side = range(step.start) if step.start <= snooping.largest_segment.start else range(step.start, len(names))
-        explain("moved", side, **_between(side, step.moved if step.distinguishable else "either", names))
+        what = _MOVED[step.moved] if step.distinguishable else "the part or the scanner moved"
+        explain("moved", side, what=what, before=names[step.start - 1], after=names[step.start])
     if snooping.alone:
         for v in snooping.alone:
             explain("alone", [v])
@@ -79,13 +80,6 @@ def explain_misplaced(
         shown = " | ".join(list_views([names[v] for v in group], names) for group in snooping.disconnected)
         explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=shown)
     return out
-
-
-def _between(views: range, moved: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the words of views at one end of the list that stand off from the rest."""
-    start = views.start or views.stop
-    what = _MOVED.get(moved, "the part or the scanner moved")
-    return {"what": what, "before": names[start - 1], "after": names[start]}
 
 
 def _single_view_problem(

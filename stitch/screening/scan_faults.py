@@ -113,12 +113,6 @@ def find_copies(capture: Capture) -> list[tuple[int, int]]:
     return [(v, w) for (v, a), (w, b) in combinations(enumerate(capture.scans), 2) if _same_points(a, b)]
 
 
-def find_identical(capture: Capture) -> list[tuple[int, int]]:
-    """Find pairs of views (v < w) whose scans are the same numbers, as those of one file twice are."""
-    every = combinations(enumerate(capture.scans), 2)
-    return [(v, w) for (v, a), (w, b) in every if np.array_equal(a.points, b.points)]
-
-
 def _same_points(a: Scan, b: Scan) -> bool:
     """True if nearly every point of `a` is found in `b`, far closer than two measurements ever agree."""
     if abs(len(a.points) - len(b.points)) > 0.02 * max(len(a.points), len(b.points)):

@@ -6,6 +6,7 @@ A rig is fitted, its views are examined, what does not belong is left out, and t
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from stitch.screening.plausibility import (
 )
 from stitch.screening.pose_tests import MAX_VIEWS_WITH_EFFECTS, length_problem
 from stitch.screening.problems import list_views
-from stitch.screening.scan_faults import find_identical
 from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.stock import find_stock, stock_problems
 from stitch.screening.target_checks import check_targets, target_warnings
@@ -213,9 +213,10 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
 
 
 def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:
-    """Yield a warning of every two scans with the same points, of which neither is left out."""
-    for v, w in find_identical(capture):
-        if not {v, w} & set(snooping.left_out):
+    """Yield a warning of every two scans with the same numbers, of which neither is left out."""
+    kept = [v for v in range(len(capture.scans)) if v not in snooping.left_out]
+    for v, w in combinations(kept, 2):
+        if np.array_equal(capture.scans[v].points, capture.scans[w].points):
             yield sentence("copies", views=f"{session.names[v]} and {session.names[w]}")
 
 

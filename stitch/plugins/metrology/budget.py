@@ -284,13 +284,7 @@ class MonteCarlo:
     """Trials beside the linear propagation of the same fits, to at most so many points of each feature."""
 
     trials: int
-    u: Array  # (Q,) standard deviation of the trials
-    propagated: Array  # (Q,) standard uncertainty by the slopes
-
-    @property
-    def ratio(self) -> Array:
-        """(Q,) of the trials over the propagation; its own standard deviation is 1/√(2 · trials)."""
-        return self.u / np.maximum(self.propagated, 1e-300)
+    ratio: Array  # (Q,) of their standard deviation over u by the slopes; its own standard deviation is 1/√(2 · trials)
 
 
 def monte_carlo(
@@ -315,7 +309,7 @@ def monte_carlo(
         loadings = _stated_loadings(stated, quantities, values)
         drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
     kept = measured_rows(quantities)
-    return MonteCarlo(trials, drawn[:, kept].std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]))
+    return MonteCarlo(trials, drawn[:, kept].std(axis=0, ddof=1) / [max(n.u, 1e-300) for n in linear.numbers])
 
 
 def _refits(

@@ -108,7 +108,7 @@ def feature_list(
 
 
 def _completed(feature: Feature, spacing: float) -> Feature:
-    """Return a feature of a program with the reach that a file gives it where nobody states one."""
+    """Return a feature with a unit axis, and with the usual reach where nobody states one."""
     axis = np.asarray(feature.axis, float)
     is_patch = feature.kind in ("point", "plane", "deviation")
     return replace(
@@ -164,13 +164,8 @@ class _Reader:
         T = self.T_reference_part
         at = frames.transform(T, self.scale * self._numbers(where, row, "at", (3,))[None])[0]
         sizes = {
-            key: self.scale * float(self._numbers(where, row, key, ())) if key in row else default
-            for key, default in (
-                ("radius", _PATCH * self.spacing),
-                ("within", _WITHIN * self.spacing),
-                ("diameter", 0.0),
-                ("length", 0.0),
-            )
+            key: self.scale * float(self._numbers(where, row, key, ())) if key in row else 0.0
+            for key in ("radius", "within", "diameter", "length")
         }
         for key in ("diameter", "length"):
             if key in _KEYS[kind] and not sizes[key] > 0:
@@ -186,15 +181,10 @@ class _Reader:
             places, normals = nearest_on_mesh(cad, at[None])
             at, axis = places[0], normals[0]
         radius = sizes["length"] / 2 if kind == "cylinder" else sizes["radius"]
-        return replace(
-            stated,
-            at=at,
-            axis=axis / np.linalg.norm(axis),
-            size=sizes["diameter"],
-            radius=radius if kind in ("point", "plane", "deviation", "cylinder") else 0.0,
-            within=sizes["within"],
-            cad=cad,
+        placed = replace(
+            stated, at=at, axis=axis, size=sizes["diameter"], radius=radius, within=sizes["within"], cad=cad
         )
+        return _completed(placed, self.spacing)
 
     @property
     def T_reference_part(self) -> Array:

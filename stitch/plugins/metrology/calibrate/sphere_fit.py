@@ -431,8 +431,12 @@ def fit_sphere(
     if free < _FREE:
         needed = -(-(n + _FREE) // 3)
         raise NoResultError(f"{len(views)} views for {n} unknowns; to fix: scan the sphere from {needed} or more poses")
+    feet = np.array([v.foot for v in views])
+    start = SphereState(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
+    scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
+    linear = linearise_sphere(G, views, start, n)
     # The points' own sum has side minima for laser lines; the views' leads to the right one.
-    fit = _reweight(G, views, _initial_linearisation(G, views, T_mount, radius, n))
+    fit = _reweight(G, views, _LinearisedSphere(start, *linear, [], scatter, np.ones(len(views))))
     if not by_views:
         # Every point counts the same: distances from a circle of radius ρ are R/ρ times those from the sphere.
         weights = [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
@@ -454,16 +458,6 @@ def fit_sphere(
         left_out=steps,
         shares=fit.shares,
     )
-
-
-def _initial_linearisation(
-    G: Array, views: Sequence[SphereView], T_mount: Array, radius: float, n: int
-) -> _LinearisedSphere:
-    feet = np.array([v.foot for v in views])
-    state = SphereState(T_mount, np.median(frames.transform(G @ T_mount, feet[:, None])[:, 0], axis=0), radius)
-    e, jacobian, response = linearise_sphere(G, views, state, n)
-    scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
-    return _LinearisedSphere(state, e, jacobian, response, weights=[], scatter=scatter, shares=np.ones(len(views)))
 
 
 def _reweight(
