@@ -136,7 +136,7 @@ def deciding_views(
     joints = possible_joints(linear)[:_TRIED]
     if not len(joints):
         return None
-    forms = competing_forms(scores, log_weights).beside(unnamed, [ranked.log_belief for ranked in rivals])
+    forms = competing_forms(scores, log_weights, [ranked.log_belief for ranked in rivals], unnamed)
     first, single = _choose(linear, forms, joints, most)
     best = joints[np.argsort(-single, kind="stable")[:_BEST]]
     closer = possible_joints(linear, best)[:_CLOSER]
@@ -166,15 +166,6 @@ class RivalForms:
     log_belief: Array  # (R,) how often each rival is met, a judgement that decides nothing by itself
     named: int  # so many rivals, the first, have a name
 
-    def beside(self, unnamed: Sequence[tuple[JointEffect, float]], log_belief: Sequence[float]) -> "RivalForms":
-        """Return them with what is believed of each, and what joints may do without a name as one rival more."""
-        weights = [*self.log_weights, *(weight for _, weight in unnamed)]
-        rival = np.append(self.rival, np.full(len(unnamed), self.named, np.int64))
-        belief = np.append(log_belief, np.zeros(int(bool(unnamed))))
-        return RivalForms(
-            [*self.scores, *(effect for effect, _ in unnamed)], np.array(weights), rival, belief, self.named
-        )
-
     def margins(self, fits: Array) -> Array:
         """Return (R, …) by how much each rival is ahead of all others, from log posteriors (R, …) of all.
 
@@ -190,8 +181,17 @@ class RivalForms:
         )
 
 
-def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
-    """Return the likeliest forms of each rival, which share its weight (R,)."""
+def competing_forms(
+    scores: Sequence[Score],
+    log_weights: Array,
+    log_belief: Sequence[float] = (),
+    unnamed: Sequence[tuple[JointEffect, float]] = (),
+) -> RivalForms:
+    """Return the likeliest forms of each rival, which share its weight (R,), and of joints without a law as one more.
+
+    Args:
+        log_belief: of each rival; () where all are met alike.
+    """
     forms = list[Score | JointEffect]()
     weights = list[float]()
     rival = list[int]()
@@ -205,7 +205,12 @@ def competing_forms(scores: Sequence[Score], log_weights: Array) -> RivalForms:
         forms += [replace(scored, form=every[i]) for i in kept]
         weights += of_rival.tolist()
         rival += [r] * len(kept)
-    return RivalForms(forms, np.array(weights), np.array(rival), np.zeros(len(scores)), len(scores))
+    forms += [effect for effect, _ in unnamed]
+    weights += [weight for _, weight in unnamed]
+    rival += [len(scores)] * len(unnamed)
+    belief = np.zeros(max(rival) + 1)
+    belief[: len(log_belief)] = log_belief
+    return RivalForms(forms, np.array(weights), np.array(rival), belief, len(scores))
 
 
 def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> tuple[DecidingViews, Array]:

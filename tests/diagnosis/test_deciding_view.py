@@ -148,8 +148,8 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
     views = deciding_views(found.linear, rivals, most=1)
     joints = possible_joints(found.linear)[:40]
     scores = [r.score for r in rivals]
-    forms = competing_forms(scores, np.array([r.log_posterior for r in rivals]))
-    forms = forms.beside(unnamed_joints(found.linear, scores), [0.0, 0.0])
+    weights = np.array([r.log_posterior for r in rivals])
+    forms = competing_forms(scores, weights, unnamed=unnamed_joints(found.linear, scores))
     tried = predict_views(found.linear, forms.scores, joints, np.zeros(len(joints)))
     draws = np.random.default_rng(5).standard_normal((2000, 6))
     right = deciding_view._decisions(tried, forms, [], np.arange(len(joints)), draws)[0]
