@@ -91,7 +91,6 @@ def export_run(
     Examples:
       stitch export runs/blade-17 --to ros
       stitch export runs/blade-17 --to kuka -o scanner.txt
-      stitch export runs/cell --scanner left --to ros
       stitch export runs/blade-17 --to glb -o blade.glb
       stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
       stitch export found-body --program place.src -o corrected.src --frame 0,0,0,0,0,0
