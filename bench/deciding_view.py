@@ -10,7 +10,6 @@ once: from 1300 to 1339 and from 1400 to 1439, each law its own; take others.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -108,18 +107,15 @@ def _diagnosed(measured: Measured, views: int) -> Diagnosis:
 def _told(found: Diagnosis, law: str) -> str:
     if found.verdict == "missing_effect":
         return "right" if found.effects == (law,) else f"wrong: {found.effects[0]}"
-    if found.verdict == "cannot_tell":
-        return f"{'cannot tell' if law in found.effects else 'not among'}: {' / '.join(found.effects)}"
-    return found.verdict
+    told = "cannot tell" if law in found.effects else "not among"
+    return f"{told}: {' / '.join(found.effects)}" if found.verdict == "cannot_tell" else found.verdict
 
 
 def summary(rows: list[Row]) -> list[str]:
     """Return what was decided, by law, and by what the first views left open."""
     asked = [row for row in rows if "after_1" in row]
     kinds = {"which of several": "cannot_tell", "a law, or none": "unknown_effect"}
-    groups = grouped(asked, "law") | {
-        words: [r for r in asked if r["verdict"] == kind] for words, kind in kinds.items()
-    }
+    groups = grouped(asked, "law") | {words: [r for r in asked if r["verdict"] == kinds[words]] for words in kinds}
     lines = markdown(
         "law | ambiguous cells | stated, one view | right | wrong | right after three | wrong",
         [
@@ -135,11 +131,11 @@ def summary(rows: list[Row]) -> list[str]:
             for law, some in (groups | {"all": asked}).items()
         ],
     )
-    without = sum(row["probability"] is None for row in asked)
+    stated = [row for row in asked if row["probability"] is not None]
     lost = sum(row[f"after_{MOST_VIEWS}"].startswith("not among") for row in asked)
-    told = f"{len(rows)} cells, {len(asked)} ambiguous; in {without} of them the view was proposed without odds. "
+    told = f"{len(rows)} cells, {len(asked)} ambiguous; in {len(asked) - len(stated)} of them the view had no odds. "
     told += f"After three views {lost} ended in a group without the true law."
-    return [told, "", *lines, "", *_odds([row for row in asked if row["probability"] is not None])]
+    return [told, "", *lines, "", *_odds(stated)]
 
 
 def _stated(rows: list[Row]) -> str:
@@ -150,13 +146,10 @@ def _stated(rows: list[Row]) -> str:
 
 def _odds(rows: list[Row]) -> list[str]:
     """Return how often one view decided, by what was stated."""
-    bands: list[tuple[Any, ...]] = []
-    for low, high in ((0.0, 0.5), (0.5, 0.8), (0.8, 1.01)):
-        some = [r for r in rows if low <= r["probability"] < high]
-        if some:
-            mean = f"{np.mean([r['probability'] for r in some]):.2f}"
-            bands.append((f"{low:.1f} … {min(high, 1.0):.1f}", mean, share(r["after_1"] == "right" for r in some)))
-    return markdown("stated | mean | decided", bands)
+    bands = {"0 … 0.5": (0.0, 0.5), "0.5 … 0.8": (0.5, 0.8), "0.8 … 1": (0.8, 1.01)}
+    within = {words: [r for r in rows if low <= r["probability"] < high] for words, (low, high) in bands.items()}
+    told = [(words, _stated(some), share(r["after_1"] == "right" for r in some)) for words, some in within.items()]
+    return markdown("stated | mean | decided", told)
 
 
 TABLE = Table(jobs, trial, summary, range(100), page="diagnosis", block="deciding-view", settings={"cells": 4})
