@@ -284,7 +284,6 @@ class _Change:
     """What an effect changes in what the model predicts of the reduced observations."""
 
     per_unit: Array  # (n, p) per unit of each parameter, hand-eye and effects in use fitted anew beside it
-    absorbed: Array  # (a, p) by how much these stand in for a unit
     values: Array  # (p,)
     covariance: Array  # (p, p)
 
@@ -300,7 +299,7 @@ def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change
     own = beside.residual(columns)
     values = fit_columns(linear.residual(columns), linear.white_residual)
     covariance = np.linalg.pinv(own.T @ own).astype(float)
-    return _Change(columns - linear.reduce(linear.design) @ absorbed, absorbed, values, covariance)
+    return _Change(columns - linear.reduce(linear.design) @ absorbed, values, covariance)
 
 
 @dataclass(frozen=True)

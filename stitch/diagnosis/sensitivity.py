@@ -189,8 +189,11 @@ def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> d
     zero, by the form that shows it best."""
     linear = linear.restricted(linear.causes - {candidate.name})
     sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
+    whole: tuple[Array | None, Array] = (None, np.zeros((0, 0)))
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        white = linear.residual(form.columns)
+        if whole[0] is not form.reduced:  # forms of one term follow each other
+            whole = form.reduced, linear.residual(form.reduced)
+        white = whole[1][:, form.keep]
         names = tuple(p.name for p in form.free)
         known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
         least = least_noncentrality(white * form.sizes, float(weight), tests, known, regime_of(linear).scales)

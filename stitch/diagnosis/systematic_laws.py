@@ -15,9 +15,9 @@ the first joint turns the base about its axis, and the last one what the flange 
 link whose growth moves part or base as a whole.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 from scipy.special import logsumexp
@@ -233,8 +233,8 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
             forms = list(_forms(place, driver))
             laws += [law for law, _ in forms]
             shares += [share for _, share in forms]
-            whole = [Law(place, driver, shape, place.whole) for shape in driver.shapes]
-            spans = [Span(law.reduced(linear.observation)) for law in whole]
+            # Mostly words tell: what the columns say is asked of few.
+            spans = cache(partial(_spans, place, driver, linear.observation))
             said = (c.name for c, forms in effects if _says(views, c, forms, place, driver, spans))
             said_by[place.name, driver.name] = frozenset(said)
     return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
@@ -606,8 +606,18 @@ def _whole_forms(candidate: Candidate) -> list[Span]:
     return [Span(form.columns) for form in forms if form.keep.sum() == forms[0].keep.sum()]
 
 
+def _spans(place: Place, driver: Driver, observation: Observation) -> list[Span]:
+    """Return each shape of a law with all numbers of its place."""
+    return [Span(Law(place, driver, shape, place.whole).reduced(observation)) for shape in driver.shapes]
+
+
 def _says(
-    views: Views, candidate: Candidate, whole: Sequence[Span], place: Place, driver: Driver, laws: Sequence[Span]
+    views: Views,
+    candidate: Candidate,
+    whole: Sequence[Span],
+    place: Place,
+    driver: Driver,
+    laws: Callable[[], Sequence[Span]],
 ) -> bool:
     """Return whether an effect is a law: it acts there and follows that, as it declares or as its columns show."""
     effect = candidate.effect
@@ -624,5 +634,5 @@ def _says(
     if (driver.name == STEP) != event:
         return False
     if whole_body:
-        return any(law.contains(form) for law in laws for form in whole)
-    return any(form.contains(law) for law in laws for form in whole)
+        return any(law.contains(form) for law in laws() for form in whole)
+    return any(form.contains(law) for law in laws() for form in whole)

@@ -322,10 +322,10 @@ class LinearModel:
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Yield per set of columns (n, P) what the views tell of their coefficients θ beside the model.
 
-        It is I (P, P) and v (P,) of the log likelihood vᵀθ − ½ θᵀIθ.
+        It is I (P, P) and v (P,) of the log likelihood vᵀθ − ½ θᵀIθ. Where sums of the model's own columns are kept,
+        so are those of these.
         """
-        kept = self.mixed.common is not None and self.mixed.sums.are_kept
-        if kept and all(selected.keep is not None for selected in columns):
+        if self.mixed.common is not None and self.mixed.sums.are_kept:
             yield from map(self._own_information.of, columns)
             return
         for start in range(0, len(columns), _SETS_AT_ONCE):

@@ -105,10 +105,13 @@ class Rows(Observation):
 
     def part_displacements(self, numbers: Array) -> Array:
         """Return the motion (V, 3) of a view that makes its rows by shifts alone; zero for one that shows nothing."""
-        V = len(self.lever)
-        shifts = self.lever[..., 3:] * self.distances_used[..., None]
-        left = numbers.reshape(self.residual.shape)[:V, :, None]
-        return (np.linalg.pinv(shifts) @ left)[..., 0]
+        left = numbers.reshape(self.residual.shape)[: len(self.lever), :, None]
+        return (self._of_shifts @ left)[..., 0]
+
+    @cached_property
+    def _of_shifts(self) -> Array:
+        """(V, 3, m) shifts of the views that make their rows."""
+        return np.linalg.pinv(self.lever[..., 3:] * self.distances_used[..., None]).astype(float)
 
     def effect_columns(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
         """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
