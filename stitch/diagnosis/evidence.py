@@ -548,11 +548,17 @@ def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
 
     Of an effect with a name only where it follows nothing of the joints, which the base knows nothing of.
     """
-    if evidence.verdict == "missing_effect" and not evidence.second:
-        named = evidence.named[0]
-        said = [r for r in evidence.laws if named.name in case.dictionary.said_by[law_of(r).key]]
-        of_joints = [r for r in said if not law_of(r).driver.name.startswith("j")][:1]
-        of_base = laws_of_base(case.linear, case.dictionary, of_joints, named.score)
+    said_by = case.dictionary.said_by
+    if evidence.named and not evidence.second:
+        of_joints = (r for r in evidence.laws if law_of(r).place.joint and not law_of(r).driver.name.startswith("j"))
+        pairs = ((r, named) for r in of_joints for named in evidence.named if named.name in said_by[law_of(r).key])
+        law, effect = next(pairs, (None, None))
+        if law is None or effect is None:
+            return None
+        of_base = laws_of_base(case.linear, case.dictionary, (law,), effect.score)
+        # What has a name is told by it.
+        names = {r.name for r in evidence.named}
+        of_base = tuple(r for r in of_base if not names & said_by[law_of(r).key])
         return Reply(_names(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
     if evidence.named or not evidence.told_laws:
         return None
