@@ -9,16 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.observations.surfaces.matching import sample_points
 from stitch.plugins.intake.convention_choice import ConventionScore, Interpretation
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.screening.conventions import fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
-from stitch.screening.linkage import Linkage
+from stitch.screening.linkage import CONTRADICTS, points_in_place
 from stitch.screening.motions import (
     FEWEST,
     ROTATION,
@@ -28,8 +28,7 @@ from stitch.screening.motions import (
     fit_motions,
     rotation_angles,
 )
-from stitch.screening.placement import place_groups
-from stitch.session.capture import Capture
+from stitch.session.capture import Capture, part_size
 
 # Motions of a group, and of all with the change undone, that close: scans of a symmetric part register wrongly now and
 # then. Those that stay open are so much fewer than as it stands.
@@ -40,117 +39,63 @@ _TRIED, _REFITS = 2, 2
 # A change of less, mm and rad, is none.
 _CHANGE_MM, _CHANGE_RAD = 1.0, 2e-3
 # Two scans lie on each other where half of the points of either, on average, lie within this share of the part's size
-# of the other. Where a point lies nearer to a scanner than what it saw there, by this share, one of both was not there.
-_ON, _NEAR, _BEFORE = 0.5, 0.01, 0.05
-# One part at two places lies on itself, once it is moved back, nearly as its scans do at one place.
-_AS_ONE = 0.93
-# Shares of such points, in the middle of all pairs: between the groups at least, within them at most.
-_BETWEEN, _WITHIN = 0.04, 0.015
+# of the other; elsewhere is farther than so many times this, within reach.
+_ON, _NEAR, _CLOSE, _REACH = 0.5, 0.01, 3.0, 0.1
 # Points of a scan that are asked, and scans before and behind it in the list that they are held against.
 _ASKED, _NEIGHBOURS = 300, 4
 
 
-def require_one_part(clouds: Sequence[Path], capture: Capture, best: ConventionScore, rows: Sequence[int]) -> None:
-    """Refuse scans of two groups that lie on each other within each, and not between them, where they show one place.
+Groups = tuple[tuple[int, ...], tuple[int, ...], float]
+
+
+def groups_apart(capture: Capture, best: ConventionScore) -> Groups | None:
+    """Return two groups of views that lie on each other within each alone, or None.
+
+    With them, of what either shows about the other's surface, the share that it shows elsewhere.
+    """
+    used = best.interpretation.pairing.used
+    poses = best.interpretation.hypothesis(0).T_reference_mount @ best.T_mount
+    pairs = [(v, w) for v in used for w in used if v != w and abs(v - w) <= _NEIGHBOURS]
+    near, reach = part_size([capture]) * np.array([_NEAR, _REACH])
+    on, elsewhere = np.zeros((2, len(poses), len(poses)))
+    for v, w in pairs if len(used) >= 2 * _FEWEST_VIEWS else ():
+        asked = sample_points(capture.scans[v], _ASKED)
+        T = frames.inverse(poses[w]) @ poses[v]
+        points = frames.transform(T, capture.scans[v].points[asked])
+        normals = frames.rotate(T, capture.scans[v].normals[asked])
+        there, close, about = (
+            points_in_place(capture.scans[w], points, normals, away) for away in (near, _CLOSE * near, reach)
+        )
+        on[v, w] = there.mean()
+        elsewhere[v, w] = (about & ~close).sum() / max(about.sum(), 1)
+    group = _linked(len(poses), [(v, w) for v, w in pairs if on[v, w] + on[w, v] >= 2 * _ON])
+    largest = np.argsort(-np.bincount(group, minlength=2))[:2]
+    first, second = (tuple(np.flatnonzero(group == k).tolist()) for k in largest)
+    between = [max(elsewhere[v, w], elsewhere[w, v]) for v, w in pairs if v in first and w in second]
+    return (first, second, float(np.median(between))) if len(second) >= _FEWEST_VIEWS and between else None
+
+
+def require_one_part(clouds: Sequence[Path], groups: Groups, best: ConventionScore, rows: Sequence[int]) -> None:
+    """Refuse scans of two groups that show the same surface at two places.
 
     Args:
         clouds: of the folder, in the order of their names.
         best: poses that fit.
-        rows: of the capture's scans among the clouds.
+        rows: of the scans among the clouds.
 
     Raises:
         InputError: names the scans of either group.
     """
-    poses = best.interpretation.hypothesis(0).T_reference_mount @ best.T_mount
-    groups = _groups_apart(capture, poses, best.interpretation.pairing.used)
-    if groups is None:
+    *sides, share = groups
+    if share < CONTRADICTS:
         return
-    first, second, share = groups
-    names = [", ".join(clouds[rows[i]].name for i in np.flatnonzero(side).tolist()) for side in (first, second)]
+    names = [", ".join(clouds[rows[i]].name for i in side) for side in sides]
     told = (
-        f"{names[0]} lie on each other, so do {names[1]}; between the two groups {share:.0%} of the points lie before "
+        f"{clouds[0].parent}: two parts, or one that changed its shape: {names[0]} lie on each other, so do {names[1]}"
     )
-    told += "what the other saw"
-    step, apart, within = _step_between(capture, poses, first, second)
-    if apart < _AS_ONE * within:
-        told = f"two parts, or one that changed its shape: {told}; brought as near as one step can, {apart:.0%} of the "
-        told += f"points lie on the other group, {within:.0%} within each"
-    else:
-        shift = ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in step[:3, 3].tolist())
-        turn = np.degrees(np.linalg.norm(frames.log(step[None])[0, :3]))
-        told = f"the part or the base changed its place: {told}, unless moved by ({shift}) mm and {turn:.2f}°"
-    raise Refusal(f"{clouds[0].parent}: {told}", *_one_group_each(clouds, best.interpretation, rows, second))
-
-
-def _groups_apart(capture: Capture, poses: Array, used: Sequence[int]) -> tuple[Mask, Mask, float] | None:
-    """Return two groups of views that contradict each other, and in what share of points; None of one part."""
-    pairs = [(v, w) for v in used for w in used if v != w and abs(v - w) <= _NEIGHBOURS]
-    if len(used) < 2 * _FEWEST_VIEWS:
-        return None
-    scans = [scan.points for scan in capture.scans]
-    on = _lying_on(capture, poses, pairs)
-    group = _linked(len(scans), [(v, w) for v, w in pairs if on[v, w] >= _ON])
-    first, second = (group == k for k in np.argsort(-np.bincount(group, minlength=2))[:2])
-    if min(first.sum(), second.sum()) < _FEWEST_VIEWS:
-        return None
-    sights = [cKDTree(points / np.linalg.norm(points, axis=1, keepdims=True)) for points in scans]
-    before = np.zeros((len(scans), len(scans)))
-    for v, w in pairs:
-        points = _seen_from(capture, poses, v, w)
-        away = np.linalg.norm(points, axis=1)
-        aside, seen = sights[w].query(points / away[:, None])
-        nearer = np.linalg.norm(scans[w][seen], axis=1) - away > _BEFORE * _scan_size(capture)
-        before[v, w] = (nearer & (aside * away < _NEAR * _scan_size(capture))).mean()
-    between = [max(before[v, w], before[w, v]) for v, w in pairs if first[v] and second[w]]
-    within = [before[v, w] for v, w in pairs if group[v] == group[w]]
-    apart = bool(between) and np.median(between) >= _BETWEEN and np.median(within) <= _WITHIN
-    return (first, second, float(np.median(between))) if apart else None
-
-
-def _lying_on(capture: Capture, poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Return (V, V) of pairs of views the share of points of either that lie on the other, on average."""
-    trees = [cKDTree(scan.points) for scan in capture.scans]
-    near = _NEAR * _scan_size(capture)
-    on = np.zeros((len(poses), len(poses)))
-    for v, w in pairs:
-        on[v, w] = (trees[w].query(_seen_from(capture, poses, v, w))[0] < near).mean()
-    return (on + on.T) / 2
-
-
-def _seen_from(capture: Capture, poses: Array, v: int, w: int) -> Array:
-    """Return some points of the view v in the scanner's frame of the view w."""
-    points = capture.scans[v].points
-    return frames.transform(frames.inverse(poses[w]) @ poses[v], points[:: -(-len(points) // _ASKED)])
-
-
-def _step_between(capture: Capture, poses: Array, first: Mask, second: Mask) -> tuple[Array, float, float]:
-    """Return the one step (4, 4) that brings the second group nearest to the first.
-
-    And what share of the points of one group lie on the other then, and within each, in the middle of all pairs.
-    """
-    parts = tuple(tuple(np.flatnonzero(side).tolist()) for side in (first, second))
-    across = [pair for v in parts[0] for w in parts[1] for pair in ((v, w), (w, v))]
-    centres = np.array(
-        [frames.transform(T, scan.points).mean(axis=0) for T, scan in zip(poses, capture.scans, strict=True)]
-    )
-    inside = [(v, w) for part in parts for v in part for w in part if v != w]
-    on = _lying_on(capture, poses, inside)
-    best = np.eye(4), 0.0
-    for shift in (centres[first].mean(axis=0) - centres[second].mean(axis=0), np.zeros(3)):
-        moved = np.array(poses)
-        moved[second, :3, 3] += shift
-        limits = (_NEAR * _scan_size(capture), _FITS)
-        for placement in [*place_groups(capture, moved, Linkage(len(poses), parts, ()), limits).values()][:1]:
-            step = placement.T @ frames.inverse(poses[parts[1][0]])
-            moved[second] = step @ poses[second]
-            lying = _lying_on(capture, moved, across)
-            best = max(best, (step, float(np.median([lying[pair] for pair in across]))), key=lambda one: one[1])
-    return *best, float(np.median([on[pair] for pair in inside]))
-
-
-def _scan_size(capture: Capture) -> float:
-    """The diagonal of the box of a scan, in the middle of all."""
-    return float(np.median([np.linalg.norm(np.ptp(scan.points, axis=0)) for scan in capture.scans]))
+    told += f"{names[1]}; {share:.0%} of the surface that either group shows of the other's it shows elsewhere"
+    later = np.isin(np.arange(len(rows)), sides[1])
+    raise Refusal(told, *_one_group_each(clouds, best.interpretation, rows, later))
 
 
 def require_no_change(
@@ -274,12 +219,12 @@ def _change_message(
     clouds: Sequence[Path], later: Mask, step: tuple[Array, str], undone: MotionFit, as_it_stands: MotionFit
 ) -> str:
     change, unit = step
-    shift = ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in change[:3, 3].tolist())
-    turn = np.degrees(np.linalg.norm(frames.log(change[None])[0, :3]))
     names = [cloud.name for cloud, is_later in zip(clouds, later, strict=True) if is_later]
     at_one = (np.diff(later.astype(int)) >= 0).all()
     told = f"a tool, the scanner, the part or the base changed at {names[0]}: the scans before it and those from it on"
     told = told if at_one else f"two lists of poses are mixed: {', '.join(names)} and the other scans"
+    shift = ", ".join(f"{round(x, 1) + 0.0:.1f}" for x in change[:3, 3].tolist())
+    turn = np.degrees(np.linalg.norm(frames.log(change[None])[0, :3]))
     told += f" fit each among themselves, by ({shift}) mm and {turn:.2f}° from another, with poses in {unit}"
     return (
         f"{clouds[0].parent}: {told}; with that undone {undone.closed:.0%} of the scanner's motions close, as it "

@@ -282,7 +282,7 @@ INPUTS = {
 }
 # Of scans that overlap, with nothing stated: the scans themselves tell what is wrong.
 OF_SCANS = {
-    "a base that changed": (later_rows([30.0, 0.0, 150.0]), NOTHING_STATED, "changed its place", {}),
+    "a base that changed": (later_rows([30.0, 0.0, 150.0]), NOTHING_STATED, "changed at", {}),
     "two parts": (moved_scans(of_another_part), NOTHING_STATED, "two parts, or one that changed", {}),
     "a wall behind": (moved_scans(before_a_wall), NOTHING_STATED, "stands still before the scanner", {}),
     "in one frame": (
