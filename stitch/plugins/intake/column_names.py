@@ -95,6 +95,12 @@ def read_names(header: Sequence[str]) -> NamedColumns:
     )
 
 
+def is_unit(text: str) -> bool:
+    """Whether a text is the unit of a length or of an angle."""
+    word = text.strip("[]() ").lower()
+    return word in _LENGTHS or word in _ANGULAR
+
+
 def bare_name(name: str) -> tuple[str, str]:
     """A name without its unit and fillers, and its unit."""
     found = _UNIT.search(name.strip())

@@ -14,7 +14,7 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.column_names import bare_name, read_names
 from stitch.plugins.intake.layouts import POSE_UNITS, possible_layouts
-from stitch.plugins.intake.pose_tables import parse_number_table, with_one_header
+from stitch.plugins.intake.pose_tables import parse_number_table
 from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, read_raw_poses
 from stitch.plugins.intake.readings import Reading, joint_readings, readings, with_joints_of
 from stitch.plugins.intake.stated_folder import StatedFolder
@@ -130,7 +130,7 @@ def read_tables(file: Path) -> list[Table]:
         told = _STATED_UNIT.search(text[:4000])
         unit = _UNIT_WORDS[told[1].lower()] if told else None
         try:
-            table = parse_number_table(file, with_one_header(text))
+            table = parse_number_table(file, text, sparse=True)
             raw = RawPoses(title, table.header, table.numbers, table.labels, table.words)
         except InputError:
             if file.suffix.lower() in WORKBOOKS:

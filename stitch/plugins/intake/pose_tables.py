@@ -1,10 +1,9 @@
 """Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
 
 import csv
-import io
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -14,7 +13,7 @@ import numpy as np
 
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import is_time_of_day
-from stitch.plugins.intake.column_names import bare_name
+from stitch.plugins.intake.column_names import bare_name, is_unit
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.text_files import shortened
 
@@ -61,7 +60,7 @@ def parse_number(cell: str) -> float | None:
     return None
 
 
-def without_trailing_blanks(cells: list[str]) -> list[str]:
+def _without_trailing_blanks(cells: list[str]) -> list[str]:
     """Cells without the empty ones at the end."""
     last = max((i for i, cell in enumerate(cells) if cell), default=-1)
     return cells[: last + 1]
@@ -72,13 +71,13 @@ NumberedRows = list[tuple[int, list[str]]]
 _SEVERAL = 3
 
 
-def trimmed_rows(rows: NumberedRows) -> NumberedRows:
+def _trimmed_rows(rows: NumberedRows) -> NumberedRows:
     """Without empty cells at the end, but for those below a name that only some rows have a remark under."""
     numbered = [cells for _, cells in rows if _number_count(cells) >= _SEVERAL]
     if not numbered:
-        return [(line, short) for line, cells in rows if (short := without_trailing_blanks(cells))]
+        return [(line, short) for line, cells in rows if (short := _without_trailing_blanks(cells))]
     written = Counter(len(cells) for cells in numbered).most_common(1)[0][0]
-    width = max(len(without_trailing_blanks(cells)) for cells in numbered)
+    width = max(len(_without_trailing_blanks(cells)) for cells in numbered)
     first, *_, last = [line for line, cells in rows if _number_count(cells) >= _SEVERAL] * 2
     out = []
     for line, cells in rows:
@@ -86,29 +85,9 @@ def trimmed_rows(rows: NumberedRows) -> NumberedRows:
         # Between rows of numbers, a name alone is a view without a pose; elsewhere it is a title or a remark.
         named = _number_count(cells) >= _SEVERAL or 2 * some > width or first < line < last
         of_table = len(cells) == written and named
-        short = cells[:width] if of_table else without_trailing_blanks(cells)
+        short = cells[:width] if of_table else _without_trailing_blanks(cells)
         out += [(line, short)] if some else []
     return out
-
-
-def rows_below_titles(rows: NumberedRows) -> NumberedRows:
-    """Without what people write above a table: rows of another length with hardly a number among their words."""
-    width = Counter(len(row) for _, row in rows).most_common(1)[0][0] if rows else 0
-    first = 0
-    while first < len(rows) - 1 and len(rows[first][1]) != width:
-        known = [parse_number(cell) is not None for cell in rows[first][1]]
-        if all(known) or sum(known) > 1:
-            break
-        first += 1
-    return rows[first:]
-
-
-def names_with_units(names: list[str], cells: list[str]) -> list[str] | None:
-    """Names with the units that stand in a row of their own below them; None where that row is none of units."""
-    if len(cells) > len(names) or _number_count(cells):
-        return None
-    below = [*cells, *[""] * (len(names) - len(cells))]
-    return [f"{name} [{cell.strip('[]() ')}]" if cell else name for name, cell in zip(names, below, strict=True)]
 
 
 def _number_count(cells: list[str]) -> int:
@@ -127,6 +106,8 @@ _SAMPLED = 2000
 _LONGEST_LINE = 100_000
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ \u202f\xa0\u2009]\d{3})+[.,]\d+)")
 _COMMENTS = ("#", "%", "//")
+# A row of names that stand over several columns has more empty cells than this leaves.
+_SPARSE = 0.6
 _COORDINATES = {*"xyz", "rx", "ry", "rz", "rotx", "roty", "rotz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
 
 
@@ -142,8 +123,11 @@ class NumberTable:
     words: str  # how it was read
 
 
-def parse_number_table(file: Path, content: str) -> NumberTable:
+def parse_number_table(file: Path, content: str, *, sparse: bool = False) -> NumberTable:
     """Read a table of numbers from the text of a file.
+
+    Args:
+        sparse: a row may lack some of its numbers, which are NaN; else it is refused.
 
     Raises:
         InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
@@ -156,11 +140,11 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     if not body or max(len(line) for _, line in body) > _LONGEST_LINE:
         raise _no_rows(file)
     separator = _separator_of([line for _, line in body[:_SAMPLED]])
-    read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
-    rows = rows_below_titles(read)
-    above = len(read) - len(rows)
-    comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
-    header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
+    cells = {i: split_cells(line, separator) for i, line in body}
+    rows = _trimmed_rows(list(cells.items()))
+    comments = [line.lstrip("#%/ ") for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
+    comment = split_cells(comments[-1], separator) if comments else []
+    header, above, rows = _split_head(file, rows, cells, comment)
     header, rows = _split_labels(header, rows)
     text, numeric = _text_and_number_columns(rows)
     cut = _is_cut_short(content, [row[numeric[-1]] for _, row in rows] if numeric else [])
@@ -168,7 +152,10 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     if len(numeric) < (1 if header else _SEVERAL):
         raise _no_rows(file)
     numbers = np.array(
-        [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
+        [
+            [_cell_number(file, i, row[c] or "nan" * (sparse or not any(row[k] for k in numeric))) for c in numeric]
+            for i, row in rows
+        ]
     )
     _require_one_decimal_mark(file, rows, numeric)
     _require_numbers(file, header, rows, text)
@@ -271,36 +258,52 @@ def _has_marks(file: Path, line: int, cell: str) -> Refusal:
     return Refusal(told, change(file, "write the numbers without them"))
 
 
-def _split_header(
-    file: Path, rows: list[tuple[int, list[str]]], comment: str, separator: str
-) -> tuple[list[str] | None, list[tuple[int, list[str]]]]:
-    """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
-    header: list[str] | None = None
-    if not rows:
-        raise _no_rows(file)
-    top, first = rows[0]
-    below = rows[1:] or rows
-    width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
-    typical = next(
-        (row for _, row in below if len(row) == width and any(parse_number(c) is not None for c in row)), first
-    )
-    texts = [parse_number(cell) is None for cell in first]
-    if len(rows) > 1 and any(t and parse_number(c) is not None for t, c in zip(texts, typical, strict=False)):
-        header, rows = first, rows[1:]
-        units = names_with_units(header, rows[0][1]) if len(rows) > 1 else None
-        if units is not None:
-            header, rows = units, rows[1:]
-    elif comment:
-        names = split_cells(comment.lstrip("#%/ "), separator)
-        header = names if len(names) == width and all(parse_number(name) is None for name in names) else None
-    odd = next(((i, row) for i, row in rows if len(row) != width), None)
-    if odd is not None:
+def _split_head(
+    file: Path, rows: NumberedRows, cells: Mapping[int, list[str]], comment: list[str]
+) -> tuple[list[str] | None, int, NumberedRows]:
+    """Return the names of the columns, how many lines of words stand above, and the rows of numbers, all of one length.
+
+    Args:
+        rows: trimmed.
+        cells: by line, as written.
+        comment: cells of the comment above the table, which may name its columns.
+    """
+    width = Counter(len(row) for _, row in rows[1:] + rows[:1]).most_common(1)[0][0]
+    typical = next((row for _, row in rows[1:] if len(row) == width and _number_count(row)), rows[0][1])
+    heads, first = list[list[str]](), 0
+    while first < len(rows) - 1:
+        line, row = rows[first]
+        written, count = [*cells[line], ""][:width], _number_count(row)
+        named = any(parse_number(c) is None and parse_number(t) is not None for c, t in zip(row, typical, strict=False))
+        # A number alone is a count, or a rate.
+        words = 2 * count <= sum(map(bool, row)) or len(row) == 1
+        if not words if len(row) != width else not named or (heads and count):
+            break
+        if len(written) == width and abs(len(cells[line]) - width) < 2 and sum(map(bool, written)) > 1 >= count:
+            heads.append(written)
+        first += 1
+    if odd := next(((i, row) for i, row in rows[first:] if len(row) != width), None):
         told = f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}"
         raise Refusal(told, change(file, "write one number a column"))
-    if header is not None and len(header) != width:
-        told = f"{file} line {top}: {len(header)} names for {width} columns"
-        raise Refusal(told, change(file, "name every column once"))
-    return header, rows
+    if not heads:
+        header = comment if len(comment) == width and not _number_count(comment) else None
+        return header, first, rows[first:]
+    units = heads.pop() if len(heads) > 1 and all(is_unit(cell) for cell in heads[-1] if cell) else [""] * width
+    above = first - len(heads) - any(units)
+    header = [_merged_name(heads, c) for c in range(width)]
+    header = [f"{name} [{unit.strip('[]() ')}]" if unit else name for name, unit in zip(header, units, strict=True)]
+    return header, above, rows[first:]
+
+
+def _merged_name(heads: list[list[str]], column: int) -> str:
+    """What stands above a column, one below the other; a name that stands over several columns counts for each."""
+    words = []
+    for row in heads:
+        name = row[column]
+        if not name and column > 1 and row is not heads[-1] and sum(map(bool, row)) < _SPARSE * len(row):
+            name = next((cell for cell in row[column:1:-1] if cell), "")
+        words += [name] * bool(name)
+    return " ".join(dict.fromkeys(words if column > 1 else words[-1:]))
 
 
 def _split_labels(header: list[str] | None, rows: NumberedRows) -> tuple[list[str] | None, NumberedRows]:
@@ -335,49 +338,6 @@ def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[lis
     width = len(rows[0][1])
     share = [sum(parse_number(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
     return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]
-
-
-_HEAD_ROWS, _SPARSE = 30, 0.6
-
-
-def with_one_header(text: str) -> str:
-    """Return a table whose rows of names stand in one row, and whose empty cells of numbers are nan."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
-    body = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
-    separator = _separator_of(body[: 10 * _HEAD_ROWS])
-    if separator == " ":
-        return text
-    rows = [split_cells(line, separator) for line in body]
-    above = [i for i, row in enumerate(rows[:_HEAD_ROWS]) if 2 * _number_count(row) <= sum(map(bool, row))]
-    first = above[-1] + 1 if above else 0
-    if first >= len(rows):
-        return text
-    width = len(rows[first])
-    heads = [
-        row for row in rows[:first] if abs(len(row) - width) <= 1 and not _number_count(row) and sum(map(bool, row)) > 1
-    ]
-    heads = [[*row, ""][:width] for row in heads]
-    counted = [sum(parse_number(row[c]) is not None for row in rows[first:] if c < len(row)) for c in range(width)]
-    out = [[cell or "nan" * bool(n) for cell, n in zip(row, counted, strict=False)] for row in rows[first:]]
-    names = [[_merged_name(heads, c) for c in range(width)]] if heads else []
-    told = io.StringIO()
-    csv.writer(told, delimiter=separator, lineterminator="\n").writerows([*names, *out])
-    return "\n".join([*([] if heads else comments), told.getvalue()])
-
-
-def _merged_name(heads: list[list[str]], column: int) -> str:
-    """What stands above a column, one below the other; a name that stands over several columns counts for each."""
-    words = []
-    for k, row in enumerate(heads):
-        own = row[column]
-        spread = sum(map(bool, row)) < _SPARSE * len(row) and column > 1
-        last = k == len(heads) - 1
-        if not own and spread and not last:
-            own = next((cell for cell in row[column:1:-1] if cell), "")
-        if own and (column > 1 or last or not any(other[column] for other in heads[k + 1 :])):
-            words.append(own)
-    return " ".join(dict.fromkeys(words))
 
 
 def _separator_of(lines: Sequence[str]) -> str:

@@ -23,7 +23,6 @@ from stitch.plugins.intake.pose_tables import (
     longest_block,
     parse_number_table,
     repeated_records,
-    with_one_header,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.announced_points import require_array_room
@@ -242,7 +241,7 @@ def _from_workbook(file: Path) -> list[RawPoses]:
     found: list[RawPoses] = []
     for name, text in workbook_sheets(file).items():
         with suppress(InputError):
-            table = parse_number_table(file, with_one_header(text))
+            table = parse_number_table(file, text, sparse=True)
             sheet = _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
             found.append(replace(sheet, part=name))
     if not found:
