@@ -249,8 +249,8 @@ def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
     return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]
 
 
-_TIMES = re.compile(r"(?:time|timestamp|stamp|zeit|t|sec|seconds)(?:_(s|ms|us|µs|ns|min|h))?")
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_TIMES = re.compile(r"(?:time|time_?stamp|stamp|zeit|t|sec|seconds)(?:_(s|seconds|ms|us|µs|ns|min|h))?")
+_SECONDS = {"s": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 # Names that views.csv keeps for itself.
 _OWN = re.compile(r"view|cloud|time_s|[xyz]|q[xyzw]|j\d+_(deg|approach)")
 
@@ -280,12 +280,12 @@ def kept_column(name: str, columns: Mapping[str, Sequence[str]]) -> bool:
     return plain in columns or (_TIMES.fullmatch(plain) is not None and "time_s" in columns)
 
 
-def recorded_times(layout: ColumnLayout) -> Array | None:
-    """Return the column of times (V,) in s since its first row; None where there is none that never falls."""
-    for name, values in layout.rest.items():
+def clock_column(columns: Mapping[str, Array]) -> Array | None:
+    """Return the first column of times (V,) by its name, s; None where there is none that never falls."""
+    for name, values in columns.items():
         timing = _TIMES.fullmatch(_plain_name(name))
         if timing and (np.diff(values) >= 0).all():
-            return np.asarray((values - values[0]) * _seconds_per_unit(values, timing[1]))
+            return np.asarray(values * _seconds_per_unit(values, timing[1]))
     return None
 
 

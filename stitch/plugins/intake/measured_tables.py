@@ -13,10 +13,10 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.column_names import bare_name, read_names
-from stitch.plugins.intake.layouts import POSE_UNITS, possible_layouts
+from stitch.plugins.intake.layouts import POSE_UNITS, clock_column
 from stitch.plugins.intake.pose_tables import parse_number_table
 from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, read_raw_poses
-from stitch.plugins.intake.readings import Reading, joint_readings, readings, with_joints_of
+from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, all_readings, with_joints_of
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.text_files import WORKBOOKS, read_any_text, workbook_sheets
@@ -79,14 +79,8 @@ class Table:
     @cached_property
     def times(self) -> Array | None:
         """(n,) s of the clock that the table keeps; None where it has none."""
-        for i, name in enumerate(self.raw.header or ()):
-            if re.search(r"\btime|stamp\b|^t$|^t[_ \[(]s", name.strip(), re.IGNORECASE):
-                scale = next(
-                    (s for word, s in (("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3)) if re.search(rf"\b_?{word}\b", name)),
-                    1.0,
-                )
-                values = self.raw.numbers[:, i] * scale
-                return np.asarray(values) if (np.diff(values) >= 0).all() else None
+        if (times := clock_column(dict(zip(self.raw.header or (), self.raw.numbers.T, strict=False)))) is not None:
+            return times
         clock = self.raw.clock
         return None if clock is None or clock.seconds is None else clock.first_s + clock.seconds
 
@@ -142,27 +136,17 @@ def read_tables(file: Path) -> list[Table]:
 
 @dataclass(frozen=True)
 class Geometry:
-    """An arm by a URDF, by a [robot] table, or by a table of DH rows, of which nobody says which kind they are."""
+    """The arm that a file holds: each way to read it, with the [robot] table, mm, that says so where it is no URDF."""
 
     file: Path
-    urdf: Path | None = None
-    tables: tuple[dict[str, Any], ...] = ()  # [robot], each a way to read it
-
-    def robots(self, joints: int) -> Iterator[tuple[Robot, dict[str, Any]]]:
-        """Arms of so many joints in mm, each with the [robot] table that says so in mm."""
-        for table in self.tables:
-            rows = table["joints"]
-            if len(rows) == joints:
-                gravity = np.array(table.get("gravity", (0, 0, -9.81)), float)
-                name, dh = table.get("name", "arm"), table.get("dh", "standard")
-                yield robot_from_dh(name, dh, rows, table.get("payload"), gravity, "mm"), table
+    arms: tuple[tuple[Path | Robot, dict[str, Any] | None], ...]
 
 
 def find_geometry(files: Sequence[Path], tables: Sequence[Table]) -> Geometry | None:
-    """Return the geometry that lies in a folder, if one does."""
+    """Return the geometry that lies in a folder, if one does: a URDF, a [robot] table, or a table of DH rows."""
     for file in files:
         if file.suffix.lower() == ".urdf":
-            return Geometry(file, urdf=file)
+            return Geometry(file, ((file, None),))
     for file in files:
         if file.suffix.lower() == ".toml":
             try:
@@ -170,26 +154,35 @@ def find_geometry(files: Sequence[Path], tables: Sequence[Table]) -> Geometry | 
             except (ValueError, OSError):
                 continue
             if "joints" in table:
-                return Geometry(file, tables=(_in_mm(table),))
-    for table in tables:
-        names = [bare_name(name)[0] or name.lower() for name in table.raw.header or ()]
+                return Geometry(file, (_arm_of(table),))
+    for dh in tables:
+        names = [bare_name(name)[0] or name.lower() for name in dh.raw.header or ()]
         if {"a", "alpha", "d"} <= set(names):
-            x = dict(zip(names, table.raw.numbers.T, strict=True))
-            turns = [x["alpha"], x.get("theta", np.zeros(len(x["a"])))]
-            if max(np.abs(turn).max() for turn in turns) <= 2 * np.pi:
-                turns = [np.degrees(turn) for turn in turns]
-            keys = ("a", "alpha_deg", "d", "theta_deg")
+            x = dict(zip(names, dh.raw.numbers.T, strict=True))
+            turns = np.array([x["alpha"], x.get("theta", np.zeros(len(x["a"])))])
+            if np.abs(turns).max() <= 2 * np.pi:
+                turns = np.degrees(turns)
             rows = [
-                dict(zip(keys, map(float, row), strict=True))
-                for row in zip(x["a"], turns[0], x["d"], turns[1], strict=True)
+                {"a": a, "alpha_deg": alpha, "d": d, "theta_deg": theta}
+                for a, alpha, d, theta in np.column_stack([x["a"], turns[0], x["d"], turns[1]]).tolist()
             ]
-            ways = [{"name": table.file.stem, "dh": dh, "joints": rows} for dh in ("standard", "modified")]
-            return Geometry(table.file, tables=tuple(map(_in_mm, ways)))
+            kinds = ("standard", "modified")  # nobody says which kind they are
+            return Geometry(
+                dh.file, tuple(_arm_of({"name": dh.file.stem, "dh": kind, "joints": rows}) for kind in kinds)
+            )
     return None
 
 
 # Links of a robot add up to more than this in mm, and to less in m.
 _LONGEST_M = 20.0
+
+
+def _arm_of(table: dict[str, Any]) -> tuple[Robot, dict[str, Any]]:
+    """The arm of a [robot] table, with the table in mm."""
+    table = _in_mm(table)
+    gravity = np.array(table.get("gravity", (0, 0, -9.81)), float)
+    name, dh = table.get("name", "arm"), table.get("dh", "standard")
+    return robot_from_dh(name, dh, table["joints"], table.get("payload"), gravity, "mm"), table
 
 
 def _in_mm(table: dict[str, Any]) -> dict[str, Any]:
@@ -228,6 +221,7 @@ def find_robot_poses(tables: Sequence[Table], geometry: Geometry | None, stated:
         InputError: several do, or joint angles without the robot's geometry.
     """
     found = list[tuple[int, RobotPoses]]()
+    arms = ((None, None),) if geometry is None else geometry.arms
     refused: InputError | None = None
     for table in tables:
         if geometry is not None and geometry.file == table.file:
@@ -236,11 +230,13 @@ def find_robot_poses(tables: Sequence[Table], geometry: Geometry | None, stated:
             said = f"{table.title} {group or ''}"
             score = 2 * bool(_ROBOT.search(said)) - 2 * bool(MEASURED.search(said)) + 9 * (table.file == stated.poses)
             try:
-                ways, jointed = _candidate_readings(raw, geometry, stated)
+                every = [(way, arm) for model, arm in arms for way in all_readings(raw, model, stated)]
             except InputError as error:
                 refused = error
                 continue
-            found.append((score + 3 * jointed, RobotPoses(table, group, raw, ways, geometry)))
+            jointed = any(way.rotation == JOINT_ANGLES for way, _ in every)
+            ways = every if jointed else [(way, None) for way, _ in every[: len(every) // len(arms)]]
+            found.append((score + 3 * jointed, RobotPoses(table, group, raw, tuple(ways), geometry)))
     if not found:
         if refused is not None:
             raise refused
@@ -262,8 +258,8 @@ def _posed(table: Table, geometry: Geometry | None) -> Iterator[tuple[str | None
         if not table.groups:
             yield None, raw
         return
-    if geometry is not None and geometry.urdf is not None:
-        raw = with_joints_of(raw, geometry.urdf)
+    if geometry is not None and isinstance(geometry.arms[0][0], Path):
+        raw = with_joints_of(raw, geometry.arms[0][0])
     named = read_names(raw.header or ())
     if len(named.rotation) in (12, 16):
         yield None, raw
@@ -284,28 +280,3 @@ def columns_of(raw: RawPoses, kept: Sequence[int], owner: str = "") -> RawPoses:
     for word in owner.split():
         header = [re.sub(rf"(?i)(?<![a-z]){re.escape(word)}[ _.:/-]*", "", name) for name in header]
     return replace(raw, header=tuple(header), numbers=raw.numbers[:, kept])
-
-
-def _candidate_readings(
-    raw: RawPoses, geometry: Geometry | None, stated: StatedFolder
-) -> tuple[tuple[ReadingOfArm, ...], bool]:
-    """Each reading, lengths as the file has them, and whether it is one of joints."""
-    out, jointed = list[ReadingOfArm](), False
-    for layout in possible_layouts(raw):
-        if layout.rotation.shape[1]:
-            out += [(way, None) for way in readings(layout, stated.rotation, stated.angle_unit)]
-            continue
-        assert layout.joints is not None
-        jointed = True
-        if geometry is None or geometry.urdf is not None:
-            urdf = None if geometry is None else geometry.urdf
-            out += [(way, None) for way in joint_readings(layout, urdf, stated.angle_unit)]
-            continue
-        for robot, table in geometry.robots(layout.joints.shape[1]):
-            out += [(way, table) for way in joint_readings(layout, robot, stated.angle_unit)]
-        if not out:
-            raise InputError(
-                f"{geometry.file}: has another number of joints than {raw.source}, {layout.joints.shape[1]}; to fix: "
-                "write one row a joint"
-            )
-    return tuple(out), jointed

@@ -269,7 +269,7 @@ def _split_head(
         comment: cells of the comment above the table, which may name its columns.
     """
     width = Counter(len(row) for _, row in rows[1:] + rows[:1]).most_common(1)[0][0]
-    typical = next((row for _, row in rows[1:] if len(row) == width and _number_count(row)), rows[0][1])
+    typical = max((row for _, row in rows[1:_SAMPLED] + rows[:1] if len(row) == width), key=_number_count)
     heads, first = list[list[str]](), 0
     while first < len(rows) - 1:
         line, row = rows[first]
@@ -277,7 +277,9 @@ def _split_head(
         named = any(parse_number(c) is None and parse_number(t) is not None for c, t in zip(row, typical, strict=False))
         # A number alone is a count, or a rate.
         words = 2 * count <= sum(map(bool, row)) or len(row) == 1
-        if not words if len(row) != width else not named or (heads and count):
+        # Numbers between words, as of markers, are none of the table.
+        between = _number_count(rows[first + 1][1]) == 0 and len(rows[first + 1][1]) == width
+        if not words if len(row) != width else not named or (heads and count and not between):
             break
         if len(written) == width and abs(len(cells[line]) - width) < 2 and sum(map(bool, written)) > 1 >= count:
             heads.append(written)

@@ -166,11 +166,11 @@ def _rotation_reading(layout: ColumnLayout, R: Rotation, word: str, unit: str | 
     return Reading(frames.make(R.as_matrix(), layout.position), word, unit, layout, rank)
 
 
-def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:
+def all_readings(raw: RawPoses, arm: Path | Robot | None, stated: StatedTable) -> list[Reading]:
     """Every reading of a table that is not ruled out by what a person states.
 
     Args:
-        urdf: of the robot, where the table may hold joint angles.
+        arm: URDF of the robot, or the arm in mm, where the table may hold joint angles.
 
     Raises:
         InputError: columns that hold no pose.
@@ -180,9 +180,9 @@ def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[
         if layout.rotation.shape[1]:
             out += readings(layout, stated.rotation, stated.angle_unit)
         else:
-            out += joint_readings(layout, urdf, stated.angle_unit)
-    if raw.header is None and raw.numbers.shape[1] >= 6 and urdf is not None and stated.rotation is None:
-        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, urdf, stated.angle_unit)]
+            out += joint_readings(layout, arm, stated.angle_unit)
+    if raw.header is None and raw.numbers.shape[1] >= 6 and isinstance(arm, Path) and stated.rotation is None:
+        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, arm, stated.angle_unit)]
     return out
 
 
@@ -316,6 +316,9 @@ def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: s
     if isinstance(arm, Path) and (sliding := _readings_of_sliding_arm(arm, layout, angle_unit or layout.angle_unit)):
         return sliding
     robot = arm if isinstance(arm, Robot) else arm_from_urdf(arm, joints.shape[1])[0]
+    if robot.n_joints != joints.shape[1]:
+        told = f"{robot.name}: has {robot.n_joints} joints, the table {joints.shape[1]}"
+        raise Refusal(told, Fix("name the columns with --columns", {"columns": "COLUMNS"}))
     out = []
     for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
         T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)

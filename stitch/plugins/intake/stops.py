@@ -10,7 +10,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.plugins.intake.clock_times import times_of_both
 from stitch.plugins.intake.cloud_pairs import LACKING, named_pairing
-from stitch.plugins.intake.layouts import POSE_UNITS, pose_units, recorded_times
+from stitch.plugins.intake.layouts import POSE_UNITS, clock_column, pose_units
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, StatedTable, all_readings
 from stitch.plugins.intake.refusals import Fix, Refusal
@@ -135,7 +135,7 @@ def _rows_at_stops(found: Sequence[Reading], count: int) -> Indices:
     usual = {(r.layout.words, r.angle_unit, r.rotation == "rotation-vector"): r for r in found}
     for reading in usual.values():
         T = _metric_poses(reading)
-        times = recorded_times(reading.layout)
+        times = clock_column(reading.layout.rest)
         at = np.arange(len(T), dtype=float) if times is None else times
         around = 1.0 if times is None else AROUND
         before = np.searchsorted(at, at - around)
