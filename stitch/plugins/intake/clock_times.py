@@ -5,8 +5,9 @@ Times of day stand in tables as 09:14:13, with a date or without; cameras and RO
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import date
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,7 @@ _CLOCK = re.compile(
     r"(?P<h>[01]?\d|2[0-3]):(?P<m>[0-5]\d)(?::(?P<s>[0-5]\d(?:[.,]\d+)?))?(?: ?(?P<half>[AP]M)|Z)?",
     re.IGNORECASE,
 )
-_YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")
-_YEAR_LAST = re.compile(r"(\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{2})")
-DAY_S, _CENTURY = 86400.0, 2000
+DAY_S = 86400.0
 # Of this century, counted in seconds since 1970.
 EPOCH_S = (0.9e9, 4.0e9)
 DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
@@ -89,18 +88,11 @@ def _time_of_day_seconds(cell: str, day_first: bool) -> float | None:
 
 def _date_ordinal(text: str, day_first: bool) -> int | None:
     """Days; None where it is no date. With dots the day always stands first."""
-    if found := _YEAR_FIRST.fullmatch(text):
-        year, month, day = map(int, found.groups())
-    elif found := _YEAR_LAST.fullmatch(text):
-        first, second, year = int(found[1]), int(found[3]), int(found[4])
-        year += _CENTURY * (len(found[4]) == 2)
-        day, month = (first, second) if day_first or found[2] == "." else (second, first)
-    else:
-        return None
-    try:
-        return date(year, month, day).toordinal()
-    except ValueError:
-        return None
+    order = "%d-%m" if day_first or "." in text else "%m-%d"
+    for form in ("%Y-%m-%d", f"{order}-%Y", f"{order}-%y"):
+        with suppress(ValueError):
+            return datetime.strptime(re.sub("[./]", "-", text), form).toordinal()
+    return None
 
 
 _STAMP = re.compile(

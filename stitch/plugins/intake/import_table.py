@@ -13,9 +13,9 @@ from stitch.numerics.units import METRES
 from stitch.output.session_files import pose_columns, table_text
 from stitch.plugins.intake.column_names import bare_name, read_names
 from stitch.plugins.intake.controllers.program import ImportedTable, import_file, numbered_names
-from stitch.plugins.intake.layouts import POSE_UNITS, ColumnLayout, covariate_columns, pose_units, possible_layouts
+from stitch.plugins.intake.layouts import POSE_UNITS, covariate_columns, pose_units, possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses, is_program, read_raw_poses
-from stitch.plugins.intake.readings import Reading, StatedTable, angle_units, readings
+from stitch.plugins.intake.readings import StatedTable, angle_units, readings
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 
 # Of a quaternion with two digits.
@@ -91,22 +91,31 @@ def import_table(file: Path, raw: RawPoses, unit: str, stated: StatedTable) -> I
         InputError: no poses, or what the file does not say and no flag states; names the flag.
     """
     raw = raw.renamed(stated.columns) if stated.columns else raw
-    found = possible_layouts(raw)
-    if len(found) > 1:
-        ways = "; or ".join(layout.words for layout in found)
+    layouts = possible_layouts(raw)
+    if len(layouts) > 1:
+        ways = "; or ".join(layout.words for layout in layouts)
         raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
-    layout = found[0]
+    layout = layouts[0]
     columns: dict[str, Sequence[object]] = {"view": _view_names(raw)}
     count, words = len(columns["view"]), []
     if (clouds := _cloud_names(raw)) is not None:
         columns["cloud"] = clouds
     if layout.joints is not None:
-        degrees = _table_joints(file, layout, stated)
+        units = angle_units(layout.joints, stated.angle_unit or layout.angle_unit)
+        in_degrees = _only(file, "the unit of its joint angles", units, "state --angles deg or --angles rad") == "deg"
+        degrees = layout.joints if in_degrees else np.degrees(layout.joints)
         columns |= {f"j{i}_deg": [f"{q:.9g}" for q in joint] for i, joint in enumerate(degrees.T, 1)}
         words.append("joint angles")
     if layout.rotation.shape[1]:
-        reading = _table_reading(file, layout, stated)
-        file_unit = _table_unit(file, layout, stated)
+        found = readings(layout, stated.rotation, stated.angle_unit)
+        advice = f"state --rotation, or let the scans tell it: stitch init FOLDER --poses {file.name}"
+        _only(file, "how its numbers of rotation are to be read", [reading.rotation for reading in found], advice)
+        angles = [str(reading.angle_unit) for reading in found]
+        _only(file, "the unit of its angles", angles, "state --angles deg or --angles rad")
+        reading = found[0]
+        told = stated.length_unit or layout.length_unit
+        lengths = [told] if told else pose_units(layout.position)
+        file_unit = _only(file, "the unit of its positions", lengths, "state --file-unit")
         T = frames.inverse(reading.T) if stated.inverse else reading.T
         scale = POSE_UNITS[file_unit] / METRES[unit]
         columns |= _listed(pose_columns(frames.make(T[:, :3, :3], T[:, :3, 3] * scale)))
@@ -136,33 +145,9 @@ def _cloud_names(raw: RawPoses) -> list[str] | None:
     return None
 
 
-def _table_reading(file: Path, layout: ColumnLayout, stated: StatedTable) -> Reading:
-    found = readings(layout, stated.rotation, stated.angle_unit)
-    if len({r.rotation for r in found}) > 1:
-        usual = ", ".join(dict.fromkeys(r.rotation for r in found[:4]))
-        raise InputError(
-            f"{file}: does not say how its {layout.rotation.shape[1]} numbers of rotation are to be read; to fix: "
-            f"state --rotation {usual} …, or let the scans tell it: stitch init FOLDER --poses {file.name}"
-        )
-    if len(found) > 1:
-        raise InputError(f"{file}: does not say the unit of its angles; to fix: state --angles deg or --angles rad")
-    return found[0]
-
-
-def _table_joints(file: Path, layout: ColumnLayout, stated: StatedTable) -> np.ndarray:
-    assert layout.joints is not None
-    units: Sequence[str] = angle_units(layout.joints, stated.angle_unit or layout.angle_unit)
-    if len(units) > 1:
-        raise InputError(
-            f"{file}: does not say the unit of its joint angles; to fix: state --angles deg or --angles rad"
-        )
-    return np.asarray(layout.joints if units[0] == "deg" else np.degrees(layout.joints))
-
-
-def _table_unit(file: Path, layout: ColumnLayout, stated: StatedTable) -> str:
-    if stated.length_unit or layout.length_unit:
-        return str(stated.length_unit or layout.length_unit)
-    found = pose_units(layout.position)
-    if len(found) > 1:
-        raise InputError(f"{file}: positions may be in {' or '.join(found)}; to fix: state --file-unit")
-    return found[0]
+def _only(file: Path, what: str, found: Sequence[str], advice: str) -> str:
+    """The one of several that a file may mean; else a refusal."""
+    several = list(dict.fromkeys(found))
+    if len(several) > 1:
+        raise InputError(f"{file}: does not say {what}, {' or '.join(several[:4])}; to fix: {advice}")
+    return several[0]

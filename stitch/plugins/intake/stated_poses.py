@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ from stitch.numerics.units import METRES
 from stitch.plugins.intake.cloud_pairs import pairings
 from stitch.plugins.intake.convention_choice import choose_convention, require_own_frames
 from stitch.plugins.intake.first_session import capture_of
-from stitch.plugins.intake.layouts import MM
+from stitch.plugins.intake.layouts import MM, cloud_units, pose_units
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import Reading, all_readings
-from stitch.plugins.intake.refusals import Fix, Refusal
+from stitch.plugins.intake.refusals import Fix, Refusal, state
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.arrays import cloud_of
@@ -59,15 +59,22 @@ def _told_by_scans(
     refusal = Refusal(f"poses: {raw.numbers.shape} numbers can be read in {len(found)} ways", Fix(words))
     if len(scans) != len(raw.numbers) or len(scans) < _FEWEST_VIEWS or any(scan is None for scan in scans):
         raise refusal
-    capture = capture_of([cloud_of(scan, f"view {i}") for i, scan in enumerate(scans)], METRES[cloud_unit] / MM)
+    clouds = [cloud_of(scan, f"view {i}") for i, scan in enumerate(scans)]
     pairs = pairings([Path("scan")] * len(scans), raw.labels)[:1]
-    carries = mount == "eye_in_hand"
-    choice = choose_convention(
-        capture, cache(lambda: register_scan_pairs(capture)), found, pairs, [length_unit], carries
+    by_size = (
+        next((unit for unit in pose_units(found[0].T[:, :3, 3]) if unit in METRES), length_unit),
+        cloud_units([cloud.points for cloud in clouds])[0],
     )
-    if not choice.determined:
-        raise refusal
-    return choice.best.interpretation.reading
+    for unit, own in dict.fromkeys([(length_unit, cloud_unit), by_size]):
+        capture = capture_of(clouds, METRES[own] / MM)
+        motions = cache(partial(register_scan_pairs, capture))
+        choice = choose_convention(capture, motions, found, pairs, [unit], mount == "eye_in_hand")
+        if choice.determined and (unit, own) != (length_unit, cloud_unit):
+            told = f"with poses in {unit} and clouds in {own}, not as stated"
+            raise Refusal(f"poses: {raw.numbers.shape} numbers fit the scans {told}", state(unit=unit, cloud_unit=own))
+        if choice.determined:
+            return choice.best.interpretation.reading
+    raise refusal
 
 
 def scans_confirm(session: SessionData) -> bool:

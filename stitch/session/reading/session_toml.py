@@ -55,7 +55,9 @@ def read_session_document(file: Path) -> dict[str, Any]:
         InputError: missing, not TOML, of another format, or with a key that nobody knows.
     """
     hint = "a session is a folder with session.toml and views.csv"
-    if file.parent.is_dir():
+    if any(file.parent.glob("*/session.toml")):
+        hint += f"; to fix: name the sessions in it, {shlex.quote(str(file.parent))}/*"
+    elif file.parent.is_dir():
         # Whoever names the folder of the raw scans comes here first.
         hint += f"; to fix: `stitch init {shlex.quote(str(file.parent))}` makes one of scans and poses as they are"
     elif file.parent.exists():
