@@ -7,8 +7,9 @@ URDF lies between its root and what people call the flange.
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.screening.hypotheses import ORDERS
 from stitch.screening.motions import rotation_angles
-from stitch.session.reading.robot_description import moving_joints, poses_of_urdf, robot_from_urdf
+from stitch.session.reading.robot_description import moving_joints, poses_of_urdf
 from stitch.session.robot import Robot, forward
 
 
@@ -297,6 +298,7 @@ def candidate_units(readings: Sequence[Reading], stated: StatedTable, otherwise:
 
 
 JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"
+_SLID_MM = 20.0  # longer ways of a slide are no metres
 
 
 def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: str | None) -> list[Reading]:
@@ -313,60 +315,40 @@ def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: s
     if arm is None:
         words = "put the URDF into the folder, or give poses; with DH rows write session.toml by hand"
         raise Refusal("joint angles need the robot", change(".", words))
-    if isinstance(arm, Path) and (sliding := _readings_of_sliding_arm(arm, layout, angle_unit or layout.angle_unit)):
-        return sliding
-    robot = arm if isinstance(arm, Robot) else arm_from_urdf(arm, joints.shape[1])[0]
-    if robot.n_joints != joints.shape[1]:
-        told = f"{robot.name}: has {robot.n_joints} joints, the table {joints.shape[1]}"
-        raise Refusal(told, Fix("name the columns with --columns", {"columns": "COLUMNS"}))
-    out = []
-    for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
-        T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)
-        out.append(Reading(T, JOINT_ANGLES, unit, replace(layout, length_unit="mm"), 100 * place))
-    return out
-
-
-_SLID_MM = 20.0  # longer ways of a slide are no metres
-
-
-def _readings_of_sliding_arm(urdf: Path, layout: ColumnLayout, angle_unit: str | None) -> list[Reading]:
-    """Poses by a URDF some of whose joints slide, mm; none where all of them turn.
-
-    Effects of joints are for arms that turn, so that the joints stay beside the poses as columns.
-    """
-    joints = layout.joints
-    assert joints is not None
-    text = urdf.read_text(encoding="utf-8", errors="replace")
-    for base, flange in arm_link_pairs(urdf):
+    if isinstance(arm, Robot):
+        kinds = [(f"j{i}", "revolute") for i in range(1, arm.n_joints + 1)]
+        poses: Callable[[Array], Array] = partial(forward, arm)
+    else:
+        text = arm.read_text(encoding="utf-8", errors="replace")
+        base, flange = arm_links(arm, joints.shape[1])
         kinds = moving_joints(text, base, flange)
-        slides = [kind == "prismatic" for _, kind in kinds]
-        if not any(slides) or len(kinds) != joints.shape[1]:
-            continue
-        turning, sliding = joints[:, np.logical_not(slides)], joints[:, slides]
-        in_m = np.abs(sliding).max() <= _SLID_MM
-        columns = {
-            f"{name}_{'m' if in_m else 'mm'}" if slid else name: q
-            for (name, _), slid, q in zip(kinds, slides, joints.T, strict=True)
-        }
-        left = replace(layout, joints=None, length_unit="mm", rest=columns | layout.rest)
-        out = []
-        for place, angle in enumerate(angle_units(turning, angle_unit)):
-            scale = np.where(slides, 1.0 if in_m else 1e-3, 1.0 if angle == "rad" else np.pi / 180)
-            T = poses_of_urdf(text, base, flange, joints * scale)
-            out.append(Reading(T, _SLIDING, angle, left, 100 * place))
-        return out
-    return []
+        poses = partial(poses_of_urdf, text, base, flange)
+    if len(kinds) != joints.shape[1]:
+        told = f"{arm.name}: has {len(kinds)} joints, the table {joints.shape[1]}"
+        raise Refusal(told, Fix("name the columns with --columns", {"columns": "COLUMNS"}))
+    slides = np.array([kind == "prismatic" for _, kind in kinds])
+    in_m = np.abs(joints[:, slides]).max(initial=0.0) <= _SLID_MM
+    layout, word = replace(layout, length_unit="mm"), JOINT_ANGLES
+    if slides.any():
+        # Effects of joints are for arms that turn, so that the joints stay beside the poses as columns.
+        units = np.where(slides, "_m" if in_m else "_mm", "")
+        columns = {f"{name}{unit}": q for (name, _), unit, q in zip(kinds, units, joints.T, strict=True)}
+        layout, word = replace(layout, joints=None, rest=columns | layout.rest), _SLIDING
+    out = []
+    for place, unit in enumerate(angle_units(joints[:, ~slides], angle_unit or layout.angle_unit)):
+        scale = np.where(slides, 1.0 if in_m else 1e-3, 1.0 if unit == "rad" else np.pi / 180)
+        out.append(Reading(poses(joints * scale), word, unit, layout, 100 * place))
+    return out
 
 
 # tool0 and flange are those of ROS-Industrial.
 _FLANGES = ("tool0", "flange", "ee_link", "tcp")
-_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def with_joints_of(raw: RawPoses, urdf: Path) -> RawPoses:
     """Return a table whose columns bear the names of a robot's joints with j1, j2 … in the arm's order."""
     text = urdf.read_text(encoding="utf-8", errors="replace")
-    for base, flange in arm_link_pairs(urdf):
+    for base, flange in arm_link_pairs(text):
         names = [name for name, _ in moving_joints(text, base, flange)]
         where = [_column_of_joint(name, raw.header or ()) for name in names]
         if names and None not in where and len(set(where)) == len(where):
@@ -391,30 +373,27 @@ def _column_of_joint(joint: str, header: Sequence[str]) -> int | None:
     return found[0] if len(found) == 1 else None
 
 
-def arm_from_urdf(urdf: Path, joints: int) -> tuple[Robot, str, str]:
-    """The arm of so many joints, mm, with the links that it lies between.
+def arm_links(urdf: Path, joints: int) -> tuple[str, str]:
+    """Return root and flange of the arm between which so many joints lie.
 
     Raises:
         InputError: unreadable, or no chain of so many joints.
     """
-    reasons = [f"{urdf}: not a readable URDF; to fix: export it as plain URDF"]
-    for base, flange in arm_link_pairs(urdf):
-        try:
-            robot = robot_from_urdf(urdf, base, flange, "mm", _GRAVITY)
-        except InputError as error:
-            reasons.append(str(error))
-            continue
-        if robot.n_joints == joints:
-            return robot, base, flange
-        reasons.append(f"{urdf}: has {robot.n_joints} joints, the table {joints}; to fix: name the columns (--columns)")
-    raise InputError(reasons[-1])
+    text = urdf.read_text(encoding="utf-8", errors="replace")
+    told = "not a readable URDF; to fix: export it as plain URDF"
+    for base, flange in arm_link_pairs(text):
+        count = len(moving_joints(text, base, flange))
+        if count == joints:
+            return base, flange
+        told = f"has {count} joints, the table {joints}; to fix: name the columns (--columns)"
+    raise InputError(f"{urdf}: {told}")
 
 
-def arm_link_pairs(urdf: Path) -> list[tuple[str, str]]:
-    """Root and flange by name, else root and the child of each turning joint, the last first."""
+def arm_link_pairs(urdf: str) -> list[tuple[str, str]]:
+    """Root and flange of a URDF's text by name, else root and the child of each turning joint, the last first."""
     try:
-        root = ElementTree.parse(urdf).getroot()
-    except (OSError, ValueError, LookupError, ElementTree.ParseError):
+        root = ElementTree.fromstring(urdf)
+    except (ValueError, LookupError, ElementTree.ParseError):
         return []
     links = [str(link.get("name")) for link in root.findall("link")]
     ends = [(j.get("type"), getattr(j.find("child"), "attrib", {}).get("link")) for j in root.findall("joint")]

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -30,10 +29,9 @@ from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import lifted
 from stitch.session.reading.intrinsics import Intrinsics
-from stitch.session.reading.robot_description import moving_joints, robot_from_urdf
+from stitch.session.reading.robot_description import moving_joints, poses_of_urdf
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import shortened
-from stitch.session.robot import forward
 from stitch.system.packages import import_extra
 
 # An edge moves if it turns (rad) or shifts (m) by more between its recordings.
@@ -51,7 +49,6 @@ _TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _JOINTS, _TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
 _DEPTH = ("16UC1", "32FC1", "mono16")
 _MAX_JOINT_AGE = 0.5
-_GRAVITY = np.array([0.0, 0.0, -9.81])
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # Depth in whole numbers counts millimetres (REP 118).
 _METRES_PER_MM = 1e-3
@@ -329,7 +326,8 @@ def recorded_urdf(
     if not contents.joints or contents.urdf is None:
         lacking = "joint states" if not contents.joints else "robot_description"
         return {}, None, Guess("joints", "left out", f"the bag has no {lacking}", True, "session.toml")
-    names = _turning_joints(contents.urdf, bag_frames.base, bag_frames.flange)
+    joints = moving_joints(contents.urdf, bag_frames.base, bag_frames.flange)
+    names = [name for name, kind in joints if kind != "prismatic"]
     angles = interpolated_joints(contents, names, times) if names else None
     if angles is None:
         reason = f"its URDF has no chain from {bag_frames.base} to {bag_frames.flange} of the joints recorded"
@@ -339,27 +337,20 @@ def recorded_urdf(
     return robot, angles, Guess("joints", ", ".join(names), "the order of the URDF in the bag", True, "session.toml")
 
 
-def _turning_joints(urdf: str, base: str, flange: str) -> list[str]:
-    return [name for name, kind in moving_joints(urdf, base, flange) if kind != "prismatic"]
-
-
 def recorded_tree(contents: BagContents) -> TransformTree:
     """What tf recorded; where it recorded no motion of the arm, the motion of the joints by their URDF."""
     tree = TransformTree(contents.edges)
     if not tree.still or not contents.joints or contents.urdf is None:
         return tree
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "robot.urdf"
-        file.write_text(contents.urdf, encoding="utf-8")
-        for base, flange in arm_link_pairs(file):
-            names = _turning_joints(contents.urdf, base, flange)
-            rows = [(t, [q[name] for name in names]) for t, q in contents.joints if all(name in q for name in names)]
-            if names and rows:
-                robot = robot_from_urdf(file, base, flange, "m", _GRAVITY)
-                T = forward(robot, np.array([q for _, q in rows]))
-                moved = [(time, base, flange, pose, False) for (time, _), pose in zip(rows, T, strict=True)]
-                # Links between them, published as fixed, would hold the flange elsewhere.
-                return TransformTree([edge for edge in contents.edges if edge[2] != flange] + moved)
+    for base, flange in arm_link_pairs(contents.urdf):
+        names = [name for name, _ in moving_joints(contents.urdf, base, flange)]
+        rows = [(t, [q[name] for name in names]) for t, q in contents.joints if all(name in q for name in names)]
+        if names and rows:
+            T = poses_of_urdf(contents.urdf, base, flange, np.array([q for _, q in rows]))
+            T = frames.make(T[:, :3, :3], T[:, :3, 3] / _MM_PER_METRE)
+            moved = [(time, base, flange, pose, False) for (time, _), pose in zip(rows, T, strict=True)]
+            # Links between them, published as fixed, would hold the flange elsewhere.
+            return TransformTree([edge for edge in contents.edges if edge[2] != flange] + moved)
     return tree
 
 
@@ -430,16 +421,6 @@ def depth_array(message: Any, camera: Any, where: str) -> Array:
     return lifted(where, z, lens)
 
 
-@dataclass(frozen=True)
-class _ChosenScans:
-    """Scans that become views, in the order of time."""
-
-    messages: dict[int, int]  # number of the message of the topic -> number of the view
-    times: Array  # (V,) s
-    T_base_flange: Array  # (V, 4, 4) m
-    guess: Guess
-
-
 def write_bag_session(
     bag: Path, out: Path, topic: str | None = None, named: Sequence[str] = (), mount: str | None = None
 ) -> Made:
@@ -457,23 +438,26 @@ def write_bag_session(
     topic, of_topic = _choose_topic(bag, found, topic)
     tree = recorded_tree(found)
     told = identify_frames(tree, found.frame_of[topic], named)
-    chosen = _choose_scans(bag, found, topic, tree, told)
-    T_mount = _recorded_hand_eye(tree, told, chosen.times)
+    messages, times, T_base_flange, of_views = _choose_scans(bag, found, topic, tree, told)
+    T_mount = _recorded_hand_eye(tree, told, times)
+    of_poses = Guess("poses", f"{told.flange} in {told.base}", told.reason, True, "--frames")
+    words = "not known" if T_mount is None else "as tf has it, to begin with"
+    of_scanner = Guess("scanner.pose", words, f"of {told.scanner}", True, "session.toml")
     with whole_folder(out) as scratch:
         (scratch / "clouds").mkdir()
-        _write_scans(bag, topic, found, chosen, scratch / "clouds")
-        robot, joints, of_joints = recorded_urdf(found, told, chosen.times, scratch)
-        names = [f"v{i:03d}" for i in range(len(chosen.times))]
+        _write_scans(bag, topic, found, messages, scratch / "clouds")
+        robot, joints, of_joints = recorded_urdf(found, told, times, scratch)
+        names = [f"v{i:03d}" for i in range(len(times))]
         columns: dict[str, Any] = {"view": names, "cloud": [f"clouds/{name}.npy" for name in names]}
-        columns["time_s"] = [f"{t:.6f}" for t in chosen.times - chosen.times[0]]
+        columns["time_s"] = [f"{t:.6f}" for t in times - times[0]]
         columns |= {f"j{i + 1}_deg": q for i, q in enumerate(np.degrees(joints).T)} if joints is not None else {}
-        T = frames.make(chosen.T_base_flange[:, :3, :3], chosen.T_base_flange[:, :3, 3] * _MM_PER_METRE)
+        T = frames.make(T_base_flange[:, :3, :3], T_base_flange[:, :3, 3] * _MM_PER_METRE)
         write_table(scratch / "views.csv", columns | pose_columns(T))
         of_mount = _mount_guess(told, mount, [scratch / cloud for cloud in columns["cloud"]], T)
-        guesses = (of_topic, *_frame_guesses(told, T_mount), of_mount, chosen.guess, of_joints)
+        guesses = (of_topic, of_poses, of_scanner, of_mount, of_views, of_joints)
         toml = _session_toml(bag, of_mount.value, T_mount, robot, guesses)
         (scratch / "session.toml").write_text(toml, encoding="utf-8")
-    return Made(len(chosen.times), guesses, "run")
+    return Made(len(times), guesses, "run")
 
 
 def _mount_guess(bag_frames: BagFrames, stated: str | None, clouds: Sequence[Path], T_base_flange: Array) -> Guess:
@@ -511,7 +495,8 @@ def _choose_topic(bag: Path, contents: BagContents, stated: str | None) -> tuple
 
 def _choose_scans(
     bag: Path, contents: BagContents, topic: str, tree: TransformTree, bag_frames: BagFrames
-) -> _ChosenScans:
+) -> tuple[dict[int, int], Array, Array, Guess]:
+    """Return the view of each message that becomes one, times (V,) s, T_base_flange (V, 4, 4) m, and why."""
     times = np.array(contents.scans[topic])
     order = np.argsort(times, kind="stable")
     ordered = times[order]
@@ -524,7 +509,7 @@ def _choose_scans(
         )
     guess = Guess("views", f"{len(views)} of {len(times)} scans", "one for each stop of the arm", True, "views.csv")
     messages = {int(order[view]): number for number, view in enumerate(views)}
-    return _ChosenScans(messages, ordered[views], at[views], guess)
+    return messages, ordered[views], at[views], guess
 
 
 def _recorded_hand_eye(tree: TransformTree, bag_frames: BagFrames, times: Array) -> Array | None:
@@ -538,17 +523,11 @@ def _recorded_hand_eye(tree: TransformTree, bag_frames: BagFrames, times: Array)
     return frames.make(T[:3, :3], T[:3, 3] * _MM_PER_METRE)
 
 
-def _frame_guesses(bag_frames: BagFrames, T_mount: Array | None) -> tuple[Guess, ...]:
-    poses = Guess("poses", f"{bag_frames.flange} in {bag_frames.base}", bag_frames.reason, True, "--frames")
-    words = "not known" if T_mount is None else "as tf has it, to begin with"
-    return poses, Guess("scanner.pose", words, f"of {bag_frames.scanner}", True, "session.toml")
-
-
-def _write_scans(bag: Path, topic: str, contents: BagContents, chosen: _ChosenScans, folder: Path) -> None:
+def _write_scans(bag: Path, topic: str, contents: BagContents, messages: dict[int, int], folder: Path) -> None:
     with open_bag(bag) as reader:
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype in (CLOUD, IMAGE)]
         for number, (connection, _, raw) in enumerate(reader.messages(connections)):
-            if number not in chosen.messages:
+            if number not in messages:
                 continue
             message = reader.deserialize(raw, connection.msgtype)
             where = f"{bag} {topic}"
@@ -557,7 +536,7 @@ def _write_scans(bag: Path, topic: str, contents: BagContents, chosen: _ChosenSc
             else:
                 array = depth_array(message, _camera_info(contents, topic, where), where)
             array[..., :3] *= _MM_PER_METRE
-            np.save(folder / f"v{chosen.messages[number]:03d}.npy", array.astype(np.float32))
+            np.save(folder / f"v{messages[number]:03d}.npy", array.astype(np.float32))
 
 
 def _camera_info(contents: BagContents, topic: str, where: str) -> Any:

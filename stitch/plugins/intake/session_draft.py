@@ -17,7 +17,7 @@ from stitch.output.session_files import pose_columns, table_text, write_table
 from stitch.plugins.intake.first_session import FirstSession
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
-from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf
+from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, arm_links
 from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.plugins.intake.scan_targets import points_columns
 from stitch.session.reading.session_toml import SESSION_FORMAT
@@ -128,7 +128,7 @@ def robot_lines(folder: Path, urdf: Path | None, reading: Reading) -> list[str]:
     if joints is None or urdf is None:
         return []
     path = Path(os.path.relpath(urdf, folder)).as_posix()
-    _, base, flange = arm_from_urdf(urdf, joints.shape[1])
+    base, flange = arm_links(urdf, joints.shape[1])
     return ["[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
 
 
