@@ -104,8 +104,7 @@ def named_pairing(
     ways = (
         _by_text(clouds, labels, numbers),
         _by_time(clouds, labels, numbers),
-        _by_number(clouds, labels),
-        _by_column(clouds, numbers),
+        _by_number(clouds, labels, numbers),
     )
     # Names of which some are alike by chance pair fewer.
     return max((way for way in ways if way is not None), key=lambda way: len(way.used), default=None)
@@ -192,24 +191,21 @@ def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
     return Pairing(tuple(rows), words, True)
 
 
-def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
-    """The last number in the cloud's name is that in the name of the pose: view_07 and robot_pose_7."""
+def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None) -> Pairing | None:
+    """The last number in the cloud's name is that in the name of the pose, view_07 and robot_pose_7, or in one column.
+
+    Of columns of whole numbers, no two alike, no other may hold those of the clouds.
+    """
     own = [_last_number(cloud.stem) for cloud in clouds]
     if None in own or len(set(own)) < len(own):
         return None
-    for column in range(min(map(len, labels), default=0)):
-        theirs = [_last_number(Path(texts[column]).stem) for texts in labels]
-        if None not in theirs and len(set(theirs)) == len(theirs) and set(own) <= set(theirs):
-            return Pairing(tuple(theirs.index(number) for number in own), "by the numbers in the names", True)
-    return None
-
-
-def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:
-    """The one column of whole numbers, no two alike, in which the last numbers of the clouds' names stand."""
-    own = [_last_number(cloud.stem) for cloud in clouds]
-    if numbers is None or None in own or len(set(own)) < len(own):
-        return None
-    counted = [list(c) for c in numbers.T if len(set(c)) == len(c) and {*own} <= {*c}]
+    texts = [[_last_number(Path(text).stem) for text in column] for column in zip(*labels, strict=False)]
+    named = [
+        column for column in texts if None not in column and len(set(column)) == len(column) and {*own} <= {*column}
+    ]
+    if named:
+        return Pairing(tuple(named[0].index(number) for number in own), "by the numbers in the names", True)
+    counted = [list(c) for c in ([] if numbers is None else numbers.T) if len(set(c)) == len(c) and {*own} <= {*c}]
     if len(counted) != 1 or any(x != int(x) for x in counted[0]):
         return None
     return Pairing(tuple(counted[0].index(number) for number in own), "by the numbers in a column", True)

@@ -41,13 +41,19 @@ from stitch.plugins.intake.measured_tables import (
 )
 from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, readings
-from stitch.plugins.intake.session_draft import comment_lines, joint_columns, require_free, robot_lines, session_name
+from stitch.plugins.intake.session_draft import (
+    comment_lines,
+    joint_columns,
+    require_free,
+    robot_lines,
+    session_name,
+    write_texts,
+)
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.capture import Capture, build_capture, sightings_of
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import WORKBOOKS
 from stitch.session.session import Mount, Sighting, View
-from stitch.system.files import whole_file
 
 # Time about that of a pose within which a target's rows count, s.
 _AROUND_S = 0.25
@@ -435,18 +441,11 @@ def write_measured(folder: Path, made: MeasuredSession, *, force: bool = False) 
     shown = "points.csv" if made.way.turn is None else "frames.csv"
     if not force:
         require_free(folder, ("session.toml", "views.csv", shown))
-    folder.mkdir(parents=True, exist_ok=True)
     row_of = made.way.pairing.rows
     order = sorted((v for v in made.way.pairing.used if made.seen.targets[v]), key=lambda v: row_of[v] or 0)
     views = _views_columns(made, order, [row_of[v] or 0 for v in order])
-    texts = {
-        "views.csv": table_text(views),
-        shown: table_text(_file_columns(made, order, list(map(str, views["view"])))),
-        "session.toml": _toml(folder, made),
-    }
-    for name, text in texts.items():
-        with whole_file(folder / name) as file:
-            file.write_text(text, encoding="utf-8")
+    seen = table_text(_file_columns(made, order, list(map(str, views["view"]))))
+    write_texts(folder, {"views.csv": table_text(views), shown: seen, "session.toml": _toml(folder, made)})
 
 
 def _views_columns(made: MeasuredSession, order: Sequence[int], rows: Sequence[int]) -> dict[str, Sequence[object]]:

@@ -4,7 +4,8 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.output.session_files import pose_columns, table_text, write_table
+from stitch.output.session_files import pose_columns, table_text
 from stitch.plugins.intake.first_session import FirstSession
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
@@ -58,17 +59,20 @@ def write_draft(folder: Path, first: FirstSession, *, force: bool = False, unpac
     """
     if not force:
         require_free(folder, draft_files(bool(first.sightings)))
-    folder.mkdir(parents=True, exist_ok=True)
     if unpacked:
-        (folder / "clouds").mkdir(exist_ok=True)
+        (folder / "clouds").mkdir(parents=True, exist_ok=True)
         moved = [Path(shutil.copy(cloud, folder / "clouds")) for cloud in first.files.clouds]
         first = replace(first, files=replace(first.files, clouds=tuple(moved), folder=folder))
-    with whole_file(folder / "views.csv") as table, whole_file(folder / "session.toml") as toml:
-        table.write_text(views_text(folder, first), encoding="utf-8")
-        toml.write_text(toml_text(folder, first), encoding="utf-8")
-        if first.sightings:
-            with whole_file(folder / "points.csv") as points:
-                write_table(points, _points_table(first))
+    points = {"points.csv": table_text(_points_table(first))} if first.sightings else {}
+    write_texts(folder, {"views.csv": views_text(folder, first), "session.toml": toml_text(folder, first), **points})
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write files by name into a folder, which is made where it does not exist; all or none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as files:
+        for name, text in texts.items():
+            files.enter_context(whole_file(folder / name)).write_text(text, encoding="utf-8")
 
 
 def _points_table(first: FirstSession) -> dict[str, list[object]]:
