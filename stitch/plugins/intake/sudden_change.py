@@ -190,24 +190,25 @@ def _change_of(hypothesis: Hypothesis, motions: RelativeScans, later: Mask) -> t
     fits = [fit_motions(hypothesis, part, TRANSLATION_M / MM) for part in parts if len(part.pairs) >= FEWEST]
     if len(parts[0].pairs) < FEWEST or min(fit.closed for fit in fits) < _FITS:
         return None
-    before = fits[0]
-    T = np.array(hypothesis.T_reference_mount)
-    change = before.T_mount @ frames.inverse(fits[-1].T_mount)
-    if _is_change(change):
-        T[later] = T[later] @ frames.inverse(change)
-    else:
-        X = before.T_mount
-        across = [(v, w, m) for (v, w), m in zip(motions.pairs, motions.T, strict=True) if later[v] != later[w]]
-        steps = [T[w] @ X @ frames.inverse(T[v] @ X @ motion) for v, w, motion in across]
-        bases = [step if later[w] else frames.inverse(step) for (_, w, _), step in zip(across, steps, strict=True)]
-        if not bases:
-            return None
-        change = min(bases, key=lambda base: sum(np.linalg.norm(base[:3, 3] - other[:3, 3]) for other in bases))
-        T[later] = frames.inverse(change) @ T[later]
-    if not _is_change(change):
-        return None
-    flange = T if hypothesis.mount == "eye_in_hand" else frames.inverse(T)
-    return change, fit_motions(replace(hypothesis, T_base_flange=flange), motions, TRANSLATION_M / MM)
+    X = fits[0].T_mount
+    poses = hypothesis.T_reference_mount
+    tool = X @ frames.inverse(fits[-1].T_mount)
+    tried = [(tool, poses[later] @ frames.inverse(tool))]
+    across = [(v, w, m) for (v, w), m in zip(motions.pairs, motions.T, strict=True) if later[v] != later[w]]
+    steps = [poses[w] @ X @ frames.inverse(poses[v] @ X @ motion) for v, w, motion in across]
+    bases = [step if later[w] else frames.inverse(step) for (_, w, _), step in zip(across, steps, strict=True)]
+    if bases:
+        base = min(bases, key=lambda one: sum(np.linalg.norm(one[:3, 3] - other[:3, 3]) for other in bases))
+        tried.append((base, frames.inverse(base) @ poses[later]))
+    undone = []
+    for change, moved in tried:
+        if _is_change(change):
+            T = np.array(poses)
+            T[later] = moved
+            flange = T if hypothesis.mount == "eye_in_hand" else frames.inverse(T)
+            fit = fit_motions(replace(hypothesis, T_base_flange=flange), motions, TRANSLATION_M / MM)
+            undone.append((change, fit))
+    return min(undone, key=lambda one: one[1].open, default=None)
 
 
 def _is_change(T: Array) -> bool:
