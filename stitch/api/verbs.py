@@ -330,12 +330,8 @@ def _models(
     model: ModelFile | RunData | None, arm: ModelFile | RunData | None
 ) -> tuple[ModelFile | None, ModelFile | None]:
     """Return the model that is used as it is, and the arm that is kept."""
-    kept = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
-    return None if model is None else _model(model), kept
-
-
-def _model(model: ModelFile | RunData) -> ModelFile:
-    return model_of(model) if isinstance(model, RunData) else model
+    kept = keep_arm_effects(model_of(arm)) if isinstance(arm, RunData) else arm
+    return model_of(model) if isinstance(model, RunData) else model, kept
 
 
 def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) -> Run:

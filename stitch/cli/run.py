@@ -33,7 +33,6 @@ from stitch.system.process import end_at_once, load_on_use
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
     from stitch.model.model_toml import ModelFile
-    from stitch.recorder import Recorder
     from stitch.run_data import RunData
     from stitch.session.capture import Capture
     from stitch.session.session import SessionData
@@ -123,23 +122,29 @@ def run(
     from stitch.system.threads import begin
 
     # A second of libraries is still to be loaded, which takes one core.
-    captures = [begin(partial(prepare_capture, session)) for session in loaded]
+    captures: list[Future[Capture]] | None = [begin(partial(prepare_capture, session)) for session in loaded]
+    from stitch.api.pipeline import join_scanners, run_rig
+    from stitch.fusion.register import DEFAULT
     from stitch.output import json_file, run_folder
     from stitch.output.result_document import result_document
     from stitch.session.scanners import have_own_hand_eyes
 
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
-    are_one_run = len(loaded) == 1 or have_own_hand_eyes(loaded)
-    inner = [""] if are_one_run else [session.name for session in loaded]
-    models = _given_models(hand_eye, arm, named, effects_file, trust)
+    several_scanners = have_own_hand_eyes(loaded)
+    inner = [""] if len(loaded) == 1 or several_scanners else [session.name for session in loaded]
+    model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
     run_folder.preload_entry_points("stitch.reports")
     with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
         folders = [scratch / folder for folder in inner]
         for folder in folders:
             folder.mkdir(exist_ok=True)  # recordings are written while the run goes on
         recorders = [recorder_for(folder, recording) for folder in folders]
-        runs = _stitch(loaded, captures, models, named, keep, register, recorders)
+        if several_scanners:
+            loaded, captures = [join_scanners(loaded, model, kept, captures)], None
+        method = register or DEFAULT
+        runs = run_rig(loaded, model, recorders, named, keep, kept, register=method, captures=captures)
+        runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         with ThreadPoolExecutor(1) as beside:
             written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
             if not as_json:
@@ -151,33 +156,6 @@ def run(
     else:
         _show_written([target / folder for folder in inner], mesh_fits)
     end_at_once()
-
-
-def _stitch(
-    sessions: list[SessionData],
-    captures: list[Future[Capture]],
-    models: tuple[ModelFile | None, ModelFile | None, str | None],
-    effects: list[str],
-    keep: bool,
-    register: str | None,
-    recorders: list[Recorder],
-) -> list[RunData]:
-    """Return the run of each session, or the one of several scanners.
-
-    Args:
-        models: what `_given_models` returns.
-    """
-    from stitch.api.pipeline import join_scanners, run_rig
-    from stitch.fusion.register import DEFAULT
-    from stitch.session.scanners import have_own_hand_eyes
-
-    model, kept, own_effects = models
-    prepared: list[Future[Capture]] | None = captures
-    if have_own_hand_eyes(sessions):
-        sessions, prepared = [join_scanners(sessions, model, kept, captures)], None
-    register = register or DEFAULT
-    runs = run_rig(sessions, model, recorders, effects, keep, kept, register=register, captures=prepared)
-    return [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
 
 
 def _require_known(

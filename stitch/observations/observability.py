@@ -143,15 +143,12 @@ def unobservable(
     """Return one phrase per direction of the hand-eye that these motions cannot show."""
     gains, directions = motion_gain(captures, T_mount, *seen_part(captures, scanner), scanner)
     axes = _named_axes(captures, robot, joints)
-    hidden = _split(directions[:, gains < _VISIBLE], _reach(captures, T_mount))
+    # How far from the part a joint's axis may stand: the longest way through the cell.
+    ways = [np.linalg.norm(frames.inverse(c.poses(T_mount))[:, :3, 3], axis=1).max() for c in captures]
+    reach = max(ways) + np.linalg.norm(T_mount[:3, 3]) + np.linalg.norm(seen_part(captures)[0])
+    hidden = _split(directions[:, gains < _VISIBLE], float(reach))
     T_mount = _own_mount(captures, T_mount, scanner)
     return tuple(f"{kind} {_name(T_mount[:3, :3] @ direction, axes)}" for kind, direction in hidden)
-
-
-def _reach(captures: Sequence[Capture], T_mount: Array) -> float:
-    """Return how far from the part a joint's axis may stand: the longest way through the cell, length_unit."""
-    ways = [np.linalg.norm(frames.inverse(c.poses(T_mount))[:, :3, 3], axis=1).max() for c in captures]
-    return float(max(ways)) + float(np.linalg.norm(T_mount[:3, 3])) + float(np.linalg.norm(seen_part(captures)[0]))
 
 
 def _split(hidden: Array, reach: float) -> list[tuple[str, Array]]:

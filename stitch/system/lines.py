@@ -41,16 +41,16 @@ class PeopleConsole(Console):
 
     def print(self, *objects: Any, soft_wrap: bool | None = None, **options: Any) -> None:
         """Print as rich does; texts printed with `soft_wrap` stay whole words, on what is no terminal whole lines."""
+
+        def whole_words(text: str) -> str:
+            lines = printable(text).split("\n")
+            return "\n".join(part for line in lines for part in broken_lines(line, self.width))
+
         if soft_wrap:
-            objects = tuple(self._whole_words(own) if isinstance(own, str) else own for own in objects)
+            show = whole_words if self.is_terminal else printable
+            objects = tuple(show(own) if isinstance(own, str) else own for own in objects)
         super().print(*objects, soft_wrap=soft_wrap, **options)
 
     def on_broken_pipe(self) -> None:
         """Whoever reads has seen enough: the rest goes nowhere, and the command still writes its files."""
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
-
-    def _whole_words(self, text: str) -> str:
-        text = printable(text)
-        if not self.is_terminal:
-            return text
-        return "\n".join(line for own in text.split("\n") for line in broken_lines(own, self.width))
