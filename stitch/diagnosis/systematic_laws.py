@@ -621,7 +621,8 @@ def _says(
 ) -> bool:
     """Return whether an effect is a law: it acts there and follows that, as it declares or as its columns show."""
     effect = candidate.effect
-    if effect.place != place.kind:
+    # An external axis moves a body as a whole: the part, or the base of what it carries.
+    if effect.place != place.kind and not (effect.place == "axis" and place.kind in _BODIES):
         return False
     follows = {*effect.needs, *effect.prefers}
     if effect.prefers and not any(views.has(name) for name in effect.prefers):
