@@ -154,7 +154,7 @@ for line in (["run", "s", "-o", "r"], ["compare", "r"], ["report", "r", "--no-di
     try:
         main(line)
     except SystemExit as stop:
-        if ended.code:
+        if stop.code:
             raise
 """
 
