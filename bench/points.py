@@ -91,11 +91,8 @@ def swept_session(
     moved = np.vstack([np.zeros(6), np.sign(np.diff(joints, axis=0))])
     before = np.vstack([joints[:1], joints[:-1]])
     joint, _, link = parameter.partition("_")
-    one = (
-        value * np.ones(6)
-        if parameter == "all"
-        else value * np.eye(6)[int(joint[-1]) - 1 if joint[-1:].isdigit() else 0]
-    )
+    number = int(joint[-1]) - 1 if joint[-1:].isdigit() else 0
+    one = value * (np.ones(6) if parameter == "all" else np.eye(6)[number])
     hung = replace(arm, mass=np.eye(6)[int(link or 1) - 1], com=np.zeros((6, 3)))
     hung = (
         arm if parameter == "all" else hung if load is None else replace(arm, payload_mass=load, payload_com=_LOAD_AT)
@@ -223,11 +220,8 @@ def load_trial(job: Row) -> Row:
     joint = int(rng.integers(2, 4))
     size = _SOFT if job["hidden"] == "joint_compliance" else _ECCENTRIC
     letter = "c" if job["hidden"] == "joint_compliance" else "AB"[int(rng.integers(2))]
-    hidden = (
-        job["hidden"],
-        f"{letter}{joint}",
-        float(size * rng.choice([1, 1.5]) * rng.choice([-1, 1]) ** (letter != "c")),
-    )
+    value = float(size * rng.choice([1, 1.5]) * rng.choice([-1, 1]) ** (letter != "c"))
+    hidden = (job["hidden"], f"{letter}{joint}", value)
     alone, linears = [], []
     arm = ARMS["ABB IRB 120"]
     still = rng.uniform(-0.5, 0.5, 6)

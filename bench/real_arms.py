@@ -114,16 +114,8 @@ def turning_summary(rows: list[Row]) -> list[str]:
     for (targets, within), group in grouped(rows, "targets", "within").items():
         inside = share(r["open"] or r.get("sigmas2", np.inf) < THREE_SIGMA for r in group)
         worst = max((r["mm"] for r in group if "mm" in r), default=np.nan)
-        lines.append(
-            (
-                targets,
-                within,
-                inside,
-                sum(r["open"] for r in group),
-                sum(bool(r["ended"]) for r in group),
-                f"{worst:.2f}",
-            )
-        )
+        told = sum(r["open"] for r in group), sum(bool(r["ended"]) for r in group)
+        lines.append((targets, within, inside, *told, f"{worst:.2f}"))
     return markdown(
         "targets | positions within, mm | within three sigmas, or open | said to be open | refused | farthest off, mm",
         lines,
