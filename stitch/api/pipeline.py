@@ -101,7 +101,6 @@ def run_rig(
     """
     method_named(register)
     require_same_rig(sessions, model)
-    require_measured_once(sessions)
     if model:
         sessions = [with_model_axes(session, model) for session in sessions]
     recorders = recorders or [SilentRecorder() for _ in sessions]
@@ -114,6 +113,7 @@ def run_rig(
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
         asked = [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())]
         sessions, measurements = _measured(sessions, captures, asked)
+        require_measured_once(sessions)
         hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
         measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
         seconds = clock.lap()
