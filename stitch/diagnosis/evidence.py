@@ -1,48 +1,41 @@
-"""Evidence for a verdict, gathered by questions that are asked in order.
+"""Evidence for a verdict: what would explain the views (`naming`), and what that is then held against.
 
-`NAMING` asks which effects would explain the views and what explains them as well; `TESTS` hold what is named against
-views left out, halves of the views, the scanner's own errors and rivals that predict as well. Each question changes the
-evidence at most, and its answer is kept (`Evidence.answers`): the last one that changed what is named decided.
-
-A candidate is scored without its own share of the pose errors (`score`), while every other joint and link may err by as
-much as the views show. What two effects can both do no single one is wanted for, since the errors that remain do the
-other's part: then the smallest set is sought without which the views cannot do (`required_group`).
+`TESTS` hold a name against views left out, halves of the views, the scanner's own errors and rivals that predict as
+well: questions that are asked in order, as those that led to the name.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.naming import (
+    Case,
+    Question,
+    Reply,
+    answered,
+    ask,
+    both_missing,
+    find_missing_pair,
+    names_of,
+    propose,
+)
 from stitch.diagnosis.ranking import (
     Ranked,
     beyond_belief_text,
     conditioned_on_effects,
     is_certain,
     is_contender,
-    rank,
-    rank_all,
     rank_one,
-    rescored_against,
-    stands_out,
     too_large,
 )
-from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, promising, score
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sensitivity import imitated_share
-from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, law_of, laws_of_base, rank_laws
-from stitch.diagnosis.unmodelled_time_effects import (
-    find_repeating_errors,
-    least_log_bayes_factor,
-    unmodelled_log_posterior,
-)
+from stitch.diagnosis.systematic_laws import dictionary_of, law_of, laws_of_base
 from stitch.diagnosis.validation import CrossValidation, cross_validate, objection_in_halves
-from stitch.diagnosis.verdict import Answer, Evidence, scanner_explains_it
+from stitch.diagnosis.verdict import Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
 from stitch.model.model import ARM_PLACES, Term
 from stitch.observations.linear_model import LinearModel
@@ -50,37 +43,11 @@ from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views
-from stitch.system.threads import parallel
 
 # The effect of the direction from which a joint comes.
 _BY_DIRECTION = "backlash"
 # Share of a joint's moves on either side of a jump that go one way, and the moves there must be to tell.
 _ONE_WAY, _FEWEST_MOVES = 0.95, 3
-
-
-class Reply(NamedTuple):
-    """An answer in words, what it changes in the evidence, and whether the next questions do not arise."""
-
-    text: str
-    changes: Mapping[str, Any] = {}
-    ends: bool = False
-
-
-class Case(NamedTuple):
-    """What all questions are asked about: the views of a session, and effects that could be missing."""
-
-    linear: LinearModel
-    candidates: Sequence[Candidate]
-    dictionary: Dictionary
-
-    @property
-    def many_views(self) -> bool:
-        """True where many views tell several effects apart at once."""
-        return regime_of(self.linear).many_views
-
-
-# A question; None where it does not arise.
-Question = Callable[[Case, Evidence], Reply | None]
 
 
 def gather_evidence(
@@ -92,265 +59,12 @@ def gather_evidence(
         overlap_misfit: rms that no motion of the views removes (`overlap_misfit_beyond_noise`), length_unit.
     """
     case = Case(linear, candidates, dictionary_of(linear, candidates))
-    proposed = _propose_names(case, limit)
+    proposed = propose(case, limit)
     evidence = ask(TESTS, case, replace(proposed, proposed=proposed))
     if overlap_misfit:
         misfit = Reply("yes, beyond the noise", {"overlap_misfit": overlap_misfit})
-        evidence = _answered(evidence, overlap_misfit_beyond_noise, misfit)
+        evidence = answered(evidence, overlap_misfit_beyond_noise, misfit)
     return evidence
-
-
-def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
-    """Return the effects that would explain the views, and what explains them as well; nothing is left out yet."""
-    return _propose_names(Case(linear, candidates, dictionary_of(linear, candidates)), limit)
-
-
-def _propose_names(case: Case, limit: ScatterLimit) -> Evidence:
-    ranked, empirical = rank_all(case.linear, case.candidates)
-    laws = rank_laws(case.linear, case.dictionary)
-    evidence = Evidence(
-        ranked,
-        empirical,
-        laws=laws,
-        dictionary=case.dictionary,
-        implausible_scatter=implausible(case.linear, limit),
-        beyond_expected=beyond_expected(case.linear, expected_scatter(case.linear, limit)),
-    )
-    return ask(NAMING, case, evidence)
-
-
-def ask(questions: Sequence[Question], case: Case, evidence: Evidence) -> Evidence:
-    """Return the evidence after questions that were asked in order, with their answers."""
-    for question in questions:
-        reply = question(case, evidence)
-        if reply is None:
-            continue
-        evidence = _answered(evidence, question, reply)
-        if reply.ends:
-            break
-    return evidence
-
-
-def _answered(evidence: Evidence, question: Callable[..., object], reply: Reply) -> Evidence:
-    """Return the evidence with what a reply changes, and with the answer; a docstring's first line is the question."""
-    after = replace(evidence, **reply.changes)
-    changed = after.verdict != evidence.verdict or [r.name for r in after.named] != [r.name for r in evidence.named]
-    sentence = (question.__doc__ or "").strip().splitlines()[0]
-    answer = Answer(question.__name__, sentence, reply.text, changed)
-    return replace(after, answers=(*evidence.answers, answer))
-
-
-def is_anything_certain(case: Case, evidence: Evidence) -> Reply | None:
-    """Is an effect certain by itself, or a shape without a cause?"""
-    certain = [r for r in evidence.ranked if is_certain(r)]
-    shapes = [r for r in (*evidence.empirical, *evidence.laws) if stands_out(r)]
-    shape = max(shapes, key=lambda r: r.log_posterior, default=None)
-    if shape is None and not certain:
-        return Reply("no")
-    return Reply(_names(certain) or "a shape without a cause", {"alarm": True, "shape": shape})
-
-
-def are_several_required(case: Case, evidence: Evidence) -> Reply | None:
-    """Are several effects required of which none is certain by itself?"""
-    if evidence.alarm:
-        return None
-    group = required_group(case.linear, case.candidates, len(evidence.ranked))
-    return Reply(_names(group) or "no", {"explanation": group}, ends=bool(group))
-
-
-def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
-    """Which effect explains most, where none that could be named is among the errors that remain?"""
-    if not evidence.alarm:
-        return None
-    contenders = [r for r in evidence.ranked if is_contender(r)]
-    if not contenders:
-        return Reply("none that could be named", ends=True)
-    first = contenders[0]
-    while hidden := _hidden_contenders(case, contenders):
-        contenders += hidden
-    base = _without(case.linear, contenders)
-    if len(contenders) > 1 and base is not case.linear:
-        # There their Bayes factors are over one and the same.
-        contenders = [rescored_in(base, r) for r in contenders]
-    ranked = _with_hidden(evidence.ranked, first, contenders)
-    laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
-    contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
-    best = contenders[0]
-    rivals = case.dictionary.without(base, laws, best)
-    unmodelled = max([unmodelled_log_posterior(base), *(r.log_posterior for r in rivals)])
-    shapes = [r for r in (*evidence.empirical, *rivals) if stands_out(r)]
-    shape = max(shapes, key=lambda r: r.log_posterior, default=None)
-    changes = {
-        "laws": laws,
-        "explanation": (best,),
-        "together": (best,),
-        "shape": shape and (shape if shape in rivals else rescored_in(base, shape)),
-        "contenders": tuple(contenders),
-        "base": base,
-        "unmodelled_log_posterior": unmodelled,
-        "ranked": rescored_against(ranked, best, unmodelled),
-    }
-    return Reply(best.name, changes)
-
-
-def _without(linear: LinearModel, effects: Sequence[Ranked]) -> LinearModel:
-    """Return the model in which none of the effects is among the errors that remain."""
-    return linear.restricted(linear.causes - {r.name for r in effects})
-
-
-def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]:
-    """Return effects that could be named only where no contender is among the errors that remain: a base that gives
-    way, or an uneven gear, explains nothing beside joints that may give way by as much as the views show."""
-    base = _without(case.linear, contenders)
-    if base is case.linear:
-        return []
-    known = {r.name for r in contenders}
-    weak = [c for c in case.candidates if not c.empirical and c.name not in known]
-    remaining = [c for c in weak if c.name in base.causes]
-    likely = promising(base, [c for c in weak if c not in remaining], limits.CANDIDATES_TRIED)
-    tried = [*remaining, *(candidate for candidate, _ in likely)]
-    again = rank(list(parallel(partial(score, base), tried)), contenders[0].tests)[0]
-    return [r for r in again if is_contender(r)]
-
-
-def _with_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
-    """Return the ranking with those contenders that were none in it; posterior shares make room for them.
-
-    Args:
-        first: the contender that was the likeliest.
-        contenders: as they are scored now.
-    """
-    now = {r.name: r for r in contenders}
-    hidden = [now[r.name] for r in ranked if r.name in now and not is_contender(r)]
-    behind = {r.name: r.log_posterior - now[first.name].log_posterior for r in hidden}
-    for name in behind:
-        ranked = rescored_against(ranked, first, first.log_posterior + behind[name])
-    share = next(r.posterior for r in ranked if r.name == first.name)
-    beside = dict[str, Ranked]()
-    for r in hidden:
-        less = r.score.log_bayes_factor - now[first.name].score.log_bayes_factor
-        beside[r.name] = replace(
-            r,
-            score=replace(r.score, log_bayes_factor=first.score.log_bayes_factor + less),
-            log_posterior=first.log_posterior + behind[r.name],
-            posterior=share * float(np.exp(behind[r.name])),
-        )
-    return tuple(sorted((beside.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
-
-
-def which_hold_together(case: Case, evidence: Evidence) -> Reply | None:
-    """Of many views: which effects are missing at once, each holding its place beside the others?"""
-    if not evidence.alarm or not case.many_views:
-        return None
-    best = evidence.explanation[0]
-    shape = evidence.shape
-    selection = forward_selection(case.linear, case.candidates, best)
-    explained = max(selection.explained, best.log_posterior)
-    nothing = {"explanation": (), "together": (), **_refusals(selection.refused)}
-    if shape is not None and shape.log_posterior > explained + limits.ODDS:
-        return Reply("none: a shape without a cause explains more", nothing, ends=True)
-    if selection.refused and not selection.effects:
-        return Reply("none holds beyond the measured poses", nothing, ends=True)
-    effects, idle = list(selection.effects or (best,)), dict[str, str]()
-    if not regime_of(case.linear).prior:
-        effects, idle = keep_worth_adding(case.linear, effects, sum(not c.empirical for c in case.candidates))
-    refused = _refusals(selection.refused | idle)
-    if not effects:
-        return Reply("none helps on views left out", {**nothing, **refused, "alarm": False})
-    further = effects[1] if len(effects) > 1 else None
-    changes = {"explanation": tuple(effects[:1]), "further": further, "together": tuple(effects), **refused}
-    return Reply(_names(effects), changes)
-
-
-def do_poses_err_without_a_name(case: Case, evidence: Evidence) -> Reply | None:
-    """Where no effect is wanted: do the poses err again in a way that has no name?"""
-    if evidence.alarm:
-        return None
-    errors = find_repeating_errors(case.linear)
-    text = "they " + " and ".join(error.words for error in errors) if errors else "no"
-    return Reply(text, {"repeating_errors": errors}, ends=True)
-
-
-def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Reply | None:
-    """Of few views: does something without a name explain them as well, alone and beside a second effect?
-
-    Two known effects at once may look like none of them: the best is tried with a second one.
-    """
-    if case.many_views:
-        return None
-    best = evidence.explanation[0]
-    if not _beaten_by_unmodelled(best.log_posterior, evidence):
-        return Reply("no")
-    second = find_second_effect(case.linear, case.candidates, best)
-    if second is not None:
-        prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
-        of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
-        if not _beaten_by_unmodelled(of_both, evidence):
-            # The likelier one beside the other goes first, which alone may have been the weaker.
-            beside = rank_one(conditioned_on_effects(case.linear, [second]), best.score.candidate, second.tests)
-            pair = (best, second) if beside.log_posterior >= second.log_posterior else (second, beside)
-            return Reply(f"not beside {second.name}", _naming(pair))
-    return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
-
-
-def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply | None:
-    """Is it wanted beside the others and beside any trend without a name, of a joint or in time?
-
-    A trend that is as likely is a rival: these views cannot tell it from the effect. One that is likelier explains them
-    instead.
-    """
-    if regime_of(case.linear).prior:
-        return None  # the prior of pose errors has asked already
-    best, *others = evidence.together
-    factor, trend = least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score)
-    if factor > limits.ODDS:
-        return Reply("yes")
-    if factor > -limits.ODDS:
-        return Reply(f"or {trend}", {"rival_trend": trend})
-    note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views better"
-    return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
-
-
-def which_come_near(case: Case, evidence: Evidence) -> Reply | None:
-    """Which other effects come within 20 to 1?"""
-    if evidence.further is not None:
-        return None  # each was asked beside the other
-    best = evidence.explanation[0]
-    others = [r for r in evidence.contenders if r.name != best.name and r.name not in evidence.refused]
-    near = [r for r in others if r.comes_near(best)]
-    return Reply(_names(near) or "none", {"explanation": (best, *near)})
-
-
-def which_laws_come_near(case: Case, evidence: Evidence) -> Reply | None:
-    """Which laws that are no effect's come within 20 to 1, wherever they act and whatever they follow?"""
-    best, *others = evidence.together or evidence.explanation
-    base = conditioned_on_effects(evidence.base or case.linear, others)
-    laws = rank_laws(base, case.dictionary) if others else evidence.laws
-    rivals = case.dictionary.without(base, laws, best)
-    near = tuple(r for r in rivals if r.log_posterior > best.log_posterior - limits.ODDS and stands_out(r))
-    return Reply(_names(near) or "none", {"rival_laws": near})
-
-
-def are_two_missing(case: Case, evidence: Evidence) -> Reply | None:
-    """Of few views: are two missing, of which one alone took for itself what both do?"""
-    if len(evidence.explanation) == 1 or case.many_views:
-        return None
-    pair = find_missing_pair(case.linear, case.candidates, evidence.explanation[0])
-    return Reply("no") if pair is None else Reply(_names(pair), _naming(pair))
-
-
-NAMING: tuple[Question, ...] = (
-    is_anything_certain,
-    are_several_required,
-    which_explains_most,
-    which_hold_together,
-    do_poses_err_without_a_name,
-    does_an_unmodelled_effect_explain_it,
-    is_it_wanted_beside_smooth_errors,
-    which_come_near,
-    are_two_missing,
-    which_laws_come_near,
-)
 
 
 def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
@@ -412,7 +126,7 @@ def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
     if pair is None:
         return Reply("no")
     back = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
-    return Reply(f"yes, beside {pair[1].name}", {**_naming(pair), **back})
+    return Reply(f"yes, beside {pair[1].name}", {**both_missing(pair), **back})
 
 
 def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
@@ -444,8 +158,8 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     if as_good and not case.many_views:
         pair = _pair_that_stands(case, evidence)
         if pair is not None:
-            return Reply(f"none beside {pair[1].name}", _naming(pair))
-    return Reply(_names(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
+            return Reply(f"none beside {pair[1].name}", both_missing(pair))
+    return Reply(names_of(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
 
 
 def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | None:
@@ -467,7 +181,7 @@ def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | N
         return Reply(f"no: {first.name} is not")
     other = rank_one(conditioned_on_effects(case.linear, [first]), named[0].score.candidate, tests)
     if is_certain(other) and not case.many_views:
-        return Reply(f"both are missing: {_names((other, again))}", _naming((other, again)))
+        return Reply(f"both are missing: {names_of((other, again))}", both_missing((other, again)))
     return Reply(f"yes: {first.name}", {"explanation": (*named, first), "further": None, "together": ()})
 
 
@@ -499,7 +213,7 @@ def does_the_arm_do_what_hangs_at_it(case: Case, evidence: Evidence) -> Reply | 
             alike.append(r)
     explanation = (named, *alike) if jumps else (*alike, named)
     changes = {"explanation": explanation, "further": None, "together": ()} if alike else {}
-    return Reply(_names(alike) or "no", changes)
+    return Reply(names_of(alike) or "no", changes)
 
 
 def is_its_size_believable(case: Case, evidence: Evidence) -> Reply | None:
@@ -559,13 +273,13 @@ def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
         # What has a name is told by it.
         names = {r.name for r in evidence.named}
         of_base = tuple(r for r in of_base if not names & said_by[law_of(r).key])
-        return Reply(_names(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
+        return Reply(names_of(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
     if evidence.named or not evidence.told_laws:
         return None
     of_base = laws_of_base(case.linear, case.dictionary, evidence.told_laws)
     laws = {law_of(r).key: r for r in (*evidence.laws, *of_base)}
     ranked = tuple(sorted(laws.values(), key=lambda r: -r.log_posterior))
-    return Reply(_names(of_base) or "no", {"laws": ranked} if of_base else {})
+    return Reply(names_of(of_base) or "no", {"laws": ranked} if of_base else {})
 
 
 TESTS: tuple[Question, ...] = (
@@ -619,111 +333,12 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
     return error if error.unusual else None
 
 
-def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
-    """Return effects of which some are wanted though none is alone, likeliest first; () if the views do without any.
-
-    Args:
-        tests: candidates among which the best is chosen.
-    """
-    families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
-    without_families = linear.restricted(linear.causes - set(families))
-    if not families or without_families.null.deviance < linear.null.deviance:
-        # No error of joints or links helps: none stands in for another.
-        return ()
-    known = {c.name: c for c in candidates if not c.empirical}
-    ranked = rank([score(without_families, c) for c in known.values()], tests)[0]
-    best = next((r for r in ranked if is_certain(r)), None)
-    if best is None:
-        return ()
-    asked = known[best.name]
-    removed = {best.name}
-    while not is_certain(rank_one(linear.restricted(linear.causes - removed), asked, tests)):
-        others = [name for name in families if name in known and name not in removed]
-        if not others:
-            return ()
-        bases = {name: linear.restricted(linear.causes - removed - {name}) for name in others}
-        removed.add(max(others, key=lambda name: score(bases[name], asked).log_bayes_factor))
-    base = linear.restricted(linear.causes - removed)
-    again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
-    if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
-        return ()
-    near = [r for r in again if is_contender(r) and r.comes_near(again[0])]
-    # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
-    return tuple(near) if len(near) > 1 else again
-
-
-def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
-    """Return a candidate scored in another model; it counts among as many as before."""
-    again = score(base, ranked.score.candidate)
-    return replace(
-        ranked,
-        score=again,
-        adjusted=min(1.0, again.p_value * ranked.tests),
-        log_posterior=ranked.log_posterior + again.log_bayes_factor - ranked.score.log_bayes_factor,
-    )
-
-
-def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
-    """Return the effect that explains most beside the best one, if it is certain."""
-    others = [c for c in candidates if c.name != best.name and not c.empirical]
-    ranked, _ = rank_all(conditioned_on_effects(linear, [best]), others)
-    return next((r for r in ranked if is_certain(r)), None)
-
-
-def find_missing_pair(
-    linear: LinearModel, candidates: Sequence[Candidate], best: Ranked
-) -> tuple[Ranked, Ranked] | None:
-    """Return two effects where one alone took for itself what both do, each scored beside the other.
-
-    Each must be certain beside the other, and beside the second no other may come near the first.
-    """
-    second = find_second_effect(linear, candidates, best)
-    if second is None:
-        return None
-    others = [c for c in candidates if c.name != second.name and not c.empirical]
-    first, *rest = rank_all(conditioned_on_effects(linear, [second]), others)[0]
-    if not is_certain(first) or any(
-        is_contender(r) and r.log_posterior > first.log_posterior - limits.ODDS for r in rest
-    ):
-        return None
-    again = rank_one(conditioned_on_effects(linear, [first]), second.score.candidate, tests=len(others))
-    return (first, again) if is_certain(again) else None
-
-
 def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
     """Return whether each of two effects holds on views left out beside the other, beside which it was scored."""
     return not any(
         _objection(one, cross_validate(conditioned_on_effects(linear, [other]), one.score))
         for one, other in (pair, pair[::-1])
     )
-
-
-def _beaten_by_unmodelled(known: float, evidence: Evidence) -> bool:
-    """Return whether something without a name does what effects of the library do.
-
-    A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows nothing that has a name must be
-    20 to 1 less likely, as all others that might have the name.
-
-    Args:
-        known: log posterior of the effects.
-    """
-    shape = evidence.shape
-    by_shape = shape is not None and shape.log_posterior > known + limits.ODDS
-    return by_shape or evidence.unmodelled_log_posterior > known - limits.ODDS
-
-
-def _refusals(refused: Mapping[str, str]) -> dict[str, Any]:
-    """Return the changes; what speaks against several effects is said once."""
-    return {"refused": refused, "notes": tuple(dict.fromkeys(refused.values()))}
-
-
-def _naming(pair: tuple[Ranked, Ranked]) -> dict[str, Any]:
-    """Return the changes that name the first of two effects, which are missing both."""
-    return {"explanation": pair[:1], "further": pair[1], "together": pair}
-
-
-def _names(effects: Sequence[Ranked]) -> str:
-    return ", ".join(r.name for r in effects)
 
 
 def _named_effects(evidence: Evidence) -> list[Ranked]:
@@ -753,7 +368,7 @@ def _pair_that_stands(case: Case, evidence: Evidence) -> tuple[Ranked, Ranked] |
     pair = find_missing_pair(case.linear, case.candidates, named)
     if pair is None or pair[0].name != named.name or not pair_is_validated(case.linear, pair):
         return None
-    both = replace(evidence, refuted=False, scanner_error=None, **_naming(pair))
+    both = replace(evidence, refuted=False, scanner_error=None, **both_missing(pair))
     return pair if _scanner_error_in_place_of(case.linear, both) is None else None
 
 

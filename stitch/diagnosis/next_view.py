@@ -10,7 +10,7 @@ import numpy as np
 
 from stitch.diagnosis.deciding_view import DecidingViews, deciding_views, possible_joints
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
-from stitch.diagnosis.evidence import does_an_unmodelled_effect_explain_it
+from stitch.diagnosis.naming import does_an_unmodelled_effect_explain_it
 from stitch.diagnosis.ranking import Ranked, is_contender
 from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, CLEAR_DEPENDENCE

@@ -12,8 +12,10 @@ from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import diagnose, run
 from stitch.diagnosis import evidence as gathering
+from stitch.diagnosis import naming
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.evidence import find_missing_pair, gather_evidence, pair_is_validated
+from stitch.diagnosis.evidence import gather_evidence, pair_is_validated
+from stitch.diagnosis.naming import find_missing_pair
 from stitch.diagnosis.ranking import Ranked, is_certain, rank_all
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.validation import CrossValidation
@@ -93,13 +95,13 @@ SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 def without_halves(monkeypatch):
     monkeypatch.setattr(gathering, "objection_in_halves", lambda score: None)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: HELPS)
-    monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=True))
+    monkeypatch.setattr(naming, "regime_of", lambda linear: SimpleNamespace(many_views=True))
 
 
 def upheld(monkeypatch, evidence, *, together, refused):
     """With what the views say of two effects together, and names that the scanner's own error outweighs."""
     pair = together and (together.explanation[0], together.further)
-    monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=False))
+    monkeypatch.setattr(naming, "regime_of", lambda linear: SimpleNamespace(many_views=False))
     monkeypatch.setattr(gathering, "find_missing_pair", lambda *asked: pair)
     monkeypatch.setattr(gathering, "pair_is_validated", lambda *asked: True)
     monkeypatch.setattr(gathering, "moves_points", lambda terms: True)

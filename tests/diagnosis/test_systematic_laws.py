@@ -10,7 +10,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of, candidates_of
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
-from stitch.diagnosis.evidence import propose_names
+from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
 from stitch.diagnosis.systematic_laws import GRAVITY, STEP, dictionary_of, law_of, law_size, rank_laws

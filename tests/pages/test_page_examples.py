@@ -122,7 +122,7 @@ from stitch.numerics import frames
 from stitch.diagnosis import candidates
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.evidence import propose_names
+from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
 from stitch.session.capture import prepare_capture
