@@ -249,4 +249,4 @@ def _outcomes(rows: Iterable[Row]) -> list[str]:
     return [", ".join(f"{len(group)} {name}" for name, group in counts.items())]
 
 
-TABLE = Table(jobs, trial, summary, range(4343, 4344), "how-often-right", "outside", {"cells": 200})
+TABLE = Table(jobs, trial, summary, range(4444, 4445), "how-often-right", "outside", {"cells": 200})
