@@ -102,7 +102,10 @@ def find_stock(
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
-            error = field_error(measurement_of(session, capture), Model(T_mount), unconstrained, _UNUSUAL)
+            # What one view has more of is no error that the scanner makes in all of them.
+            bare = capture.without_stock({view: stock})
+            freed = unconstrained_poses(bare, bare.poses(T_mount), unconstrained.overlaps.gate)
+            error = field_error(measurement_of(session, bare), Model(T_mount), freed, _UNUSUAL)
             return dict.fromkeys(taken) if error.rms or len(taken) + 1 > most else {view: stock}
     return {}
 
