@@ -4,13 +4,13 @@ import { foresee } from "./scene.js";
 
 // `ask` sends a command; `busy` while one that changes the run is under way.
 export function showSteps(state, ask, busy) {
-  const found = state.diagnosis, naming = found && ["missing_effect", "cannot_tell"].includes(found.verdict);
+  const found = state.diagnosis, naming = found && ["missing_effect", "cannot_tell"].includes(found.verdict), advisesGroup = naming && found.verdict === "cannot_tell";
   const step = (text, command, main, before) => element("button", { type: "button", class: main ? "main" : "", disabled: busy, onclick: () => { if (before) before(); ask(command); } }, text);
-  const adds = naming ? found.named.map((effect, i) => step(`Add ${effect}`, { kind: "add", effects: [effect] }, i === 0, () => foresee("add", effect))) : [];
+  const adds = naming ? found.named.map((effect, i) => step(`Add ${effect}`, { kind: "add", effects: [effect] }, i === 0 && !advisesGroup, () => foresee("add", effect))) : [];
   at("steps").replaceChildren(...[
     !found && step("Find what is missing", { kind: "diagnose" }, true),
     ...adds,
-    found && found.verdict === "cannot_tell" && step("Add as a group", { kind: "group" }),
+    advisesGroup && step("Add as a group", { kind: "group" }, true),
     found && found.verdict === "unknown_effect" && step("Explain", { kind: "explain" }, true),
     found && found.verdict !== "adequate" && step("Next pose", { kind: "next" }),
   ].filter(Boolean));
