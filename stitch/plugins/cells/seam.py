@@ -14,8 +14,8 @@ from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingError
 
 # Fewer points of a surface or flank fix no edge to a twentieth of a millimetre.
 _FEWEST = 25
-# Edge of the cubes whose points share what the model leaves, mm.
-_CUBE = 3.0
+# Edge of the squares whose points share what the model leaves, mm.
+_SQUARE = 3.0
 # Points further from the edge than this say nothing about it that the surface's bend does not blur, mm.
 _REACH = 22.0
 # Width of the strip along the seam that is fitted, and how far across and down it reaches, mm.
@@ -55,9 +55,9 @@ def find_edge(points: Array, normals: Array, facing: float, moves: Array | None 
         )
     a, s, h = points[top].T
     design = np.column_stack([a**0, a - rim, s, (a - rim) ** 2, s**2, (a - rim) * s])
-    surface, surface_spread, surface_gain = _robust(design, h, points[top])
+    surface, surface_spread, surface_gain = _robust(design, h, points[top, :2])
     a, s, h = points[flank].T
-    wall, wall_spread, wall_gain = _robust(np.column_stack([a**0, h, s, s**2]), a, points[flank])
+    wall, wall_spread, wall_gain = _robust(np.column_stack([a**0, h, s, s**2]), a, points[flank, 1:])
     place = _meet(surface, wall, rim)
     step = 1e-5
     columns = [(_meet(surface + step * d, wall, rim) - place) / step for d in np.eye(6)]
@@ -83,11 +83,12 @@ def _meet(surface: Array, wall: Array, rim: float) -> Array:
     return np.array([a, h])
 
 
-def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, Array]:
+def _robust(design: Array, values: Array, places: Array) -> tuple[Array, Array, Array]:
     """Return coefficients, their covariance and their change per value, of a linear fit with Tukey weights, 20 rounds.
 
-    What a facet or a bend leaves is shared by neighbours, so the covariance counts cubes of points (N, 3) and not
-    points as independent (cluster-robust sandwich, Liang & Zeger 1986).
+    What a facet or a bend leaves is shared by neighbours, so the covariance counts squares of places (N, 2) on the
+    surface and not points as independent (cluster-robust sandwich, Liang & Zeger 1986). The height is no part of a
+    place: a border between high and low points would put the noise of one sign together, and call that shared.
     """
     weight = np.ones(len(values))
     for _ in range(20):
@@ -98,11 +99,11 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, 
         weight = tukey(residual, scale)
     slope = tukey_slope(residual, scale)
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design))
-    _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
-    scores = np.zeros((cube.max() + 1, design.shape[1]))
-    np.add.at(scores, cube.ravel(), design * (weight * residual)[:, None])
-    cubes, unknowns = scores.shape
-    few = cubes / max(cubes - unknowns, 1)
+    _, square = np.unique(np.floor(places / _SQUARE).astype(int), axis=0, return_inverse=True)
+    scores = np.zeros((square.max() + 1, design.shape[1]))
+    np.add.at(scores, square.ravel(), design * (weight * residual)[:, None])
+    squares, unknowns = scores.shape
+    few = squares / max(squares - unknowns, 1)
     return coefficients, few * inverse @ scores.T @ scores @ inverse, inverse @ (design * slope[:, None]).T
 
 
