@@ -177,6 +177,19 @@ def test_edge_of_two_planes():
     assert abs(across - (-8 + 0.2 * height)) < 4 * sigma[0] < 0.02
 
 
+def test_the_sigma_of_an_edge_does_not_count_noise_twice_where_the_surface_is_the_frames_own_plane():
+    rng = np.random.default_rng(1)
+    top = np.column_stack([rng.uniform([-28, -10], [-8, 10], (3000, 2)), 0.04 * rng.standard_normal(3000)])
+    flank = np.column_stack([np.full(3000, -8.0), rng.uniform([-10, -3], [10, -0.5], (3000, 2))])
+    flank[:, 0] += 0.02 * rng.standard_normal(3000)
+    normals = np.repeat([[0, 0, 1.0], [1.0, 0, 0]], 3000, axis=0)
+    sigmas = [
+        np.sqrt(find_edge(np.vstack([top, flank]) + [0, 0, height], normals, 1.0)[1][1, 1]) for height in (0, 1.5)
+    ]
+    assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
+    assert sigmas[0] == pytest.approx(0.04 * 3 / np.sqrt(3000), rel=0.4)  # of a parabola's end
+
+
 def test_seam_at_eight_stations(door, pane):
     """Within 0.05 mm of the meshes cut at the stations; the pane stands 0.6 mm out and 2.5 mm down."""
     moved = pane.copy()

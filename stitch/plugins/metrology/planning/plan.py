@@ -188,13 +188,14 @@ def present_progress(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
     return float(np.mean([goal.progress(goal.channel.normal(chosen)) for goal in goals]))
 
 
-def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) -> list[int]:
+def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int, worth: float = _WORTH) -> list[int]:
     """Indices of further views, in the order in which they are driven.
 
     Args:
         joints: (N, n) of all views: those that are there first.
         present: how many these are.
         most: views at the most.
+        worth: progress that a view must bring.
     """
     before = list(range(present))
     chosen = list[int]()
@@ -204,7 +205,7 @@ def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) 
         if not others:
             break
         gained = mean_progress(goals, [*before, *chosen], others)
-        if gained.max() - now < _WORTH:
+        if gained.max() - now < worth:
             break
         # Of those that bring nearly the most, the one that is nearest to the view before.
         good = np.flatnonzero(gained - now >= _NEARLY * (gained.max() - now))
@@ -263,6 +264,7 @@ class PlanRequest:
     feature: Array | None = None  # (3,) reference frame; or (6,) with the direction that counts
     poses: Array | None = None  # (K, n) rad that a diagnosis proposes for this very pair: no others are sought
     refused: Array | None = None  # (K, n) rad that the arm cannot reach: nothing near them is tried
+    worth: float = _WORTH  # progress that a view must bring
 
     @property
     def place(self) -> Array | None:
@@ -350,7 +352,9 @@ def plan_further_views(session: SessionData, planned: PlannedCell, request: Plan
 
 
 def best_further_view(session: SessionData, planned: PlannedCell, refused: Sequence[Array] = ()) -> Array | None:
-    """Return joints (n,) rad of the one further view that makes the hand-eye surest; None where none does.
+    """Return joints (n,) rad of the one further view that makes the hand-eye surest; None where none sees the part.
+
+    However little it is expected to bring: of few views the arm's scatter is hardly known, and a view may show it less.
 
     Args:
         refused: joints (n,) that the arm cannot reach.
@@ -359,7 +363,7 @@ def best_further_view(session: SessionData, planned: PlannedCell, refused: Seque
         NoResultError: views that would not see the part.
     """
     errors = planned.fitted_scatter
-    request = PlanRequest(split_any=False, views=1, refused=np.array(refused) if refused else None)
+    request = PlanRequest(split_any=False, views=1, refused=np.array(refused) if refused else None, worth=0.0)
     with library_threads_off():
         scatter = errors.believed if errors else planned.cell.scatter
         _, chosen, joints = _search_views(session, planned.cell, scatter, None, request)
@@ -389,7 +393,7 @@ def _search_views(
         goals = _plan_goals(PossibleViews(every, coarse, simulated, scatter), now, request)
         possible = np.array([view.joints for view in every.views])
         most = request.views or (_ALL if now is None else _MORE)
-        chosen = choose_views(goals, possible, len(session.views), most) if goals else []
+        chosen = choose_views(goals, possible, len(session.views), most, request.worth) if goals else []
         if not chosen:
             break
         joints = possible[chosen]
