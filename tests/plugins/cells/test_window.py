@@ -182,10 +182,10 @@ def test_the_sigma_of_an_edge_does_not_count_noise_twice_where_the_surface_is_th
     top = np.column_stack([rng.uniform([-28, -10], [-8, 10], (3000, 2)), 0.04 * rng.standard_normal(3000)])
     flank = np.column_stack([np.full(3000, -8.0), rng.uniform([-10, -3], [10, -0.5], (3000, 2))])
     flank[:, 0] += 0.02 * rng.standard_normal(3000)
+    points = np.vstack([top, flank])
     normals = np.repeat([[0, 0, 1.0], [1.0, 0, 0]], 3000, axis=0)
-    sigmas = [
-        np.sqrt(find_edge(np.vstack([top, flank]) + [0, 0, height], normals, 1.0)[1][1, 1]) for height in (0, 1.5)
-    ]
+    heights = np.array([[0, 0, 0.0], [0, 0, 1.5]])
+    sigmas = [np.sqrt(find_edge(points + height, normals, 1.0)[1][1, 1]) for height in heights]
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
     assert sigmas[0] == pytest.approx(0.04 * 3 / np.sqrt(3000), rel=0.4)  # of a parabola's end
 
