@@ -55,6 +55,7 @@ TABLES = {
     "unknown-laws": "unknown_laws:TABLE",
     "watch": "watch:TABLE",
     "window": "window:TABLE",
+    "window-bond": "window:BOND",
     "window-line": "window:LINE",
 }
 

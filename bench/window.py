@@ -48,6 +48,7 @@ CASES = {
     "the same, window frame expected": ("door", LARGE_WELD, EVERYTHING, Regions(expected=(WINDOW_FRAME,))),
 }
 ALL = Errors()
+_PLACED = ("flush", "gap", "bond")
 # Sphere scans, part scans and moves of the gripper; what is not named is exact.
 SOURCES = {
     "nothing: what fit and seam leave by themselves": (EXACT, EXACT, EXACT),
@@ -196,23 +197,30 @@ def line_trial(job: Row) -> Row:
     with TemporaryDirectory() as scratch:
         folder = Path(job["keep"] if job["keep"] and job["source"] == "all together" else scratch)
         line = WindowLine(job["seed"], scans, sphere, moves)
-        write_line(folder, line)
-        if sphere == EXACT:
-            document = {"hand_eye": line.T_flange_scanner.tolist(), "length_unit": "mm"}
-            (folder / "hand-eye.json").write_text(json.dumps(document))
-        else:
-            _command("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
-        for part in ("window", "body"):
-            _command("fit", folder / f"{part}.toml", "-o", folder / f"found-{part}")
+        hand_eye_and_fits(folder, line)
         T_cell_window = line.T_cell_window
-        ends = []
-        for part in ("window", "body"):
-            path = read_columns(folder / f"found-{part}" / "path.csv", "name", "x y z a_deg b_deg c_deg")
-            ends.append(poses_from_columns(path)[-1])
-        line.place(*ends)
+        place_window(folder, line)
         write_seam(folder, line)
         _command("seam", folder / "seam.toml", "-o", folder / "seam.csv")
         return _against_truth(folder, line, T_cell_window)
+
+
+def hand_eye_and_fits(folder: Path, line: WindowLine) -> None:
+    """Everything before the window is gripped, by commands; an exact sphere's hand-eye is the true one."""
+    write_line(folder, line)
+    if line.sphere_errors == EXACT:
+        document = {"hand_eye": line.T_flange_scanner.tolist(), "length_unit": "mm"}
+        (folder / "hand-eye.json").write_text(json.dumps(document))
+    else:
+        _command("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
+    for part in ("window", "body"):
+        _command("fit", folder / f"{part}.toml", "-o", folder / f"found-{part}")
+
+
+def place_window(folder: Path, line: WindowLine) -> None:
+    """Grip and place by the corrected paths."""
+    paths = [folder / f"found-{part}" / "path.csv" for part in ("window", "body")]
+    line.place(*(poses_from_columns(read_columns(path, "name", "x y z a_deg b_deg c_deg"))[-1] for path in paths))
 
 
 def _command(*arguments: object) -> None:
@@ -277,4 +285,46 @@ def _rms(values: Array) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
+def bond_trial(job: Row) -> Row:
+    """How a window will sit at its stations, asked before it is gripped, against how it then sat (8, 3): flush, gap,
+    bond gap."""
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        line = WindowLine(job["seed"], sizes={"rebate": 30.0})
+        hand_eye_and_fits(folder, line)
+        _command("seam", folder / "before.toml", "-o", folder / "before.csv")
+        place_window(folder, line)
+        window = line.window_mesh.copy().apply_transform(frames.inverse(line.T_cell_body) @ line.T_cell_window)
+        stations = [Station("", *v).T_part_station for v in zip(*line.stations(), strict=True)]
+        flange = -line.pane.gap / 2 - 7.0  # the middle of what of it lies behind the pane
+        true = [
+            [
+                *window_scans.true_seam(window, line.body_mesh, T),
+                window_scans.true_bond_gap(window, line.body_mesh, T, flange),
+            ]
+            for T in stations
+        ]
+        with (folder / "before.csv").open() as stream:
+            rows = list(csv.DictReader(stream))
+    said, sigma = ([[float(row[head + key]) for key in _PLACED] for row in rows] for head in ("", "sigma_"))
+    return {"true": np.array(true).tolist(), "said": said, "sigma": sigma}
+
+
+def bond_summary(rows: list[Row]) -> list[str]:
+    """One row for each of what is said."""
+    true, said, sigma = (np.array([row[key] for row in rows]).reshape(-1, 3) for key in ("true", "said", "sigma"))
+    off = said - true
+    columns = np.column_stack([true.min(axis=0), true.max(axis=0), *(_rms_of(v) for v in (off, sigma, off / sigma))])
+    lines = [(name, *(f"{v:.3f}" for v in line)) for name, line in zip(_PLACED, columns, strict=True)]
+    title = f"Said before placing against what then was, {len(rows)} lines, eight places each; mm."
+    return [title, "", *markdown("what | from | to | error, rms | sigma, rms | error over sigma, rms", lines)]
+
+
+def _rms_of(values: Array) -> Array:
+    return np.sqrt((values**2).mean(axis=0))
+
+
+BOND = Table(
+    lambda seeds: ({"seed": seed} for seed in seeds), bond_trial, bond_summary, range(5), page="window", block="bond"
+)
 LINE = Table(line_jobs, line_trial, line_summary, range(5), page="window", block="line", settings={"keep": ""})

@@ -117,14 +117,27 @@ class WindowLine:
             along_edges(self.pane, "pane", self.edges, 400.0),
         ]
         where = self.T_cell_window_nominal, self.T_cell_window
-        return self._scan(self.window_mesh, *where, np.concatenate(views), self.errors)
+        return self._with_stations(self.window_mesh, *where, np.concatenate(views))
 
     def scan_body(self) -> Scans:
         """The body in pieces along the rail: an overview, then the edges of outline and window."""
         overview = over(self.body_mesh.bounds, self.grids[1], 600.0, self.rng)
         views = [overview, along_edges(self.door, "door", self.edges, 400.0)]
         where = self.T_cell_body_nominal, self.T_cell_body
-        return self._scan(self.body_mesh, *where, np.concatenate(views), self.errors)
+        return self._with_stations(self.body_mesh, *where, np.concatenate(views))
+
+    def _with_stations(self, mesh: trimesh.Trimesh, T_nominal: Array, T_true: Array, views: Array) -> Scans:
+        """The views (V, 4, 4); and two close ones at each station where the window is to be glued to a flange."""
+        scans = self._scan(mesh, T_nominal, T_true, views, self.errors)
+        if not self.door.rebate:
+            return scans
+        near = across_seam(*self.stations(), 35.0, 350.0)
+        close = self._scan(mesh, T_nominal, T_true, near, self.errors, _NARROW)
+        return Scans(
+            np.concatenate([scans.T_cell_flange, close.T_cell_flange]),
+            np.concatenate([scans.rail, close.rail]),
+            scans.clouds + close.clouds,
+        )
 
     def stations(self) -> tuple[Array, Array, Array]:
         """Eight places of the seam, across and outwards, (8, 3) each; the body's part frame."""

@@ -33,6 +33,20 @@ fit = "found-body/fit.json"  # as `stitch fit body.toml -o found-body` wrote it
 stations = "stations.csv"  # in the body's frame
 pose_sigma = {sigma:.3f}  # what one scan may stand off another: the robot's scatter in both
 """
+_BEFORE = """# How will the window sit in the body, and over its flange? Asked before it is gripped.
+format = "stitch-seam/1"
+session = "body"
+hand_eye = "hand-eye.json"
+fit = "found-body/fit.json"
+stations = "stations.csv"
+[pane]
+session = "window"
+fit = "found-window/fit.json"
+thickness = {thickness}
+[errors]
+rotation = {turn}
+translation = {shift:.4f}
+"""
 
 
 def write_line(folder: Path, line: WindowLine) -> None:
@@ -54,6 +68,10 @@ def write_line(folder: Path, line: WindowLine) -> None:
         text = _FIT.format(part=part, path=path, nominal=pose_table(T))
         (folder / f"{part}.toml").write_text(text, encoding="utf-8")
     (folder / "seam.toml").write_text(_SEAM.format(sigma=np.sqrt(2) * line.errors.shift), encoding="utf-8")
+    if line.door.rebate:
+        shift = np.hypot(line.errors.shift, line.errors.rail)
+        before = _BEFORE.format(thickness=line.pane.glass, turn=line.errors.turn, shift=shift)
+        (folder / "before.toml").write_text(before, encoding="utf-8")
 
 
 def _program(name: str, T_cell_tool: Array) -> str:

@@ -116,3 +116,13 @@ def true_seam(pane: trimesh.Trimesh, door: trimesh.Trimesh, T_part_station: Arra
         # The corner is the furthest vertex up and towards the gap.
         corners.append(own[np.argmax(own[:, 2] - side * own[:, 0])])
     return float(corners[0][2] - corners[1][2]), float(corners[1][0] - corners[0][0])
+
+
+def true_bond_gap(pane: trimesh.Trimesh, door: trimesh.Trimesh, T_part_station: Array, across: float) -> float:
+    """From the pane's inner face down to the flange behind it, at a place across the seam (station frame), mm."""
+    start = frames.transform(T_part_station, np.array([[across, 0.0, 0.0]]))
+    depths = []
+    for mesh in (pane, door):
+        down = mesh.ray.intersects_location(start + 50 * T_part_station[:3, 2], -T_part_station[None, :3, 2])[0]
+        depths.append(frames.transform(frames.inverse(T_part_station), down)[:, 2])
+    return float(depths[0].min() - depths[1].max())

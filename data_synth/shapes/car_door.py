@@ -34,6 +34,8 @@ class CarDoor:
     window_frame: float = 52.0  # width of the frame around the window
     crease: float = 0.16  # change of slope along the shoulder line
     recess: float = 16.0  # depth behind the handle
+    rebate: float = 0.0  # width of the flange that a window is glued to, inwards from its opening; none where 0
+    seat: float = 12.0  # depth of that flange's outer face
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,12 @@ def build(door: CarDoor = CarDoor()) -> trimesh.Trimesh:
 def solid(door: CarDoor) -> Manifold:
     """The door with its window cut out, drilled, and with a handle."""
     drills = union(extrude(circle(size / 2, (x, z)), -400.0, 100.0, "y") for x, z, size in holes(door))
-    return tray(door, door_outline(door) - window_outline(door)) - drills + _handle(door)
+    body = tray(door, door_outline(door) - window_outline(door)) - drills + _handle(door)
+    if not door.rebate:
+        return body
+    opening = window_outline(door)
+    ring = opening.offset(door.sheet / 2) - opening.offset(-door.rebate, circular_segments=96)
+    return body + _layer(door, ring, door.seat, door.seat + door.sheet)
 
 
 def tray(door: CarDoor, outline: CrossSection, margin: float = 5.0) -> Manifold:

@@ -100,6 +100,25 @@ def assemble_scans(placed: PlacedScans) -> JoinedScans:
     return replace(joined, carried=np.vstack(placed.carried)) if placed.carried else joined
 
 
+def with_part_yet_to_place(placed: PlacedScans, part: PlacedScans, T: Array) -> PlacedScans:
+    """Return both sets of scans as one, those of a part as if a robot had moved it by T (4, 4) of the base frame."""
+    first, poses = len(placed.names), np.concatenate([placed.T_base_flange, T @ part.T_base_flange])
+    carried = [
+        of.carried or tuple(np.zeros_like(cloud) for cloud in of.clouds)
+        for of in (placed, replace(part, carried=tuple(moved @ T[:3, :3].T for moved in part.carried)))
+    ]
+    seen = [frames.transform(S, cloud.mean(axis=0)) for S, cloud in zip(part.T_base_scanner, part.clouds, strict=True)]
+    held = T @ frames.make(np.eye(3), np.mean(seen, axis=0))
+    return replace(
+        placed,
+        names=(*placed.names, *(f"part-{name}" for name in part.names)),
+        clouds=placed.clouds + part.clouds,
+        T_base_flange=poses,
+        carried=carried[0] + carried[1] if placed.carried or part.carried else (),
+        errors=placed.errors and replace(placed.errors, T_base_flange=poses, gripped=(first, held)),
+    )
+
+
 def read_scan_table(file: Path) -> PlacedScans:
     """Read a table of scans: `file` and the scanner's pose in the base, x y z a_deg b_deg c_deg.
 
@@ -218,6 +237,7 @@ class PlacingErrors:
     rotation: float = 0.0  # of the flange about each axis, new in every view
     translation: float = 0.0  # of the flange along each axis, new in every view
     scanner: float = 0.0  # rms over the field of the scanner's smooth error along the ray, the same in all views
+    gripped: tuple[int, Array] | None = None  # scans from that one on show a part yet to be moved, held there (4, 4)
 
     def modes(self, scan: JoinedScans, source: str) -> Iterator[tuple[Indices, Array]]:
         """Yield the modes of one of SOURCES: which points move (M,), and by how much in the base frame (M, 3)."""
@@ -236,6 +256,11 @@ class PlacingErrors:
                 for xi in np.diag(np.repeat([self.rotation, self.translation], 3)):
                     if xi.any():
                         yield index, _moved(self.T_base_flange[view], still[index], xi)
+            if self.gripped is not None:
+                index = np.flatnonzero(scan.view >= self.gripped[0])
+                # The robot goes to it, and with it to its place: two moves.
+                for xi in np.sqrt(2) * np.diag(np.repeat([self.rotation, self.translation], 3)):
+                    yield index, _moved(self.gripped[1], scan.points[index], xi)
         elif self.scanner:
             yield from ((everything, self.scanner * mode) for mode in self._field_modes(scan))
 

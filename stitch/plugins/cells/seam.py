@@ -1,9 +1,10 @@
-"""Flush and gap of a seam at its stations, from the scanned edges of both parts."""
+"""Flush and gap of a seam at its stations, from both scanned edges; and the bond gap of a pane that is to be placed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
@@ -44,7 +45,9 @@ def find_edge(points: Array, normals: Array, facing: float, moves: Array | None 
     if len(flank) < _FEWEST:
         raise NoResultError(f"{len(flank)} points on the flank; to fix: scan it leaned by 30 to 45° towards it")
     rim = np.median(points[flank, 0])
-    top = np.flatnonzero((up > 0.85) & (np.abs(points[:, 0] - rim) < _REACH))
+    # Past the edge lies what is seen through the gap.
+    behind = facing * (rim - points[:, 0])
+    top = np.flatnonzero((up > 0.85) & (behind > 0) & (behind < _REACH))
     if len(top) < _FEWEST:
         raise NoResultError(f"{len(top)} points on the outer surface; to fix: scan the seam wider")
     # The flank of a bent sheet may bend too further down: only its upper part makes the edge.
@@ -72,6 +75,42 @@ def find_edge(points: Array, normals: Array, facing: float, moves: Array | None 
         [surface_gain @ (along[:, top] / up[top]).T, wall_gain @ (along[:, flank] / normals[flank, 0]).T]
     )
     return place, J @ spread @ J.T, J @ change
+
+
+def bond_gap(
+    points: Array, normals: Array, pane: NDArray[np.bool_], edge: float, thickness: float, moves: Array
+) -> tuple[float, float, Array]:
+    """Return how far a pane's inner face stands over the flange behind it, its variance, and its answers (P,) to moves.
+
+    The inner face lies a glass's thickness behind the outer one. Both faces are parabolas, of the flange across its own
+    short width a line; they are compared in the middle of what was seen of the flange behind the pane.
+
+    Args:
+        points, normals: (N, 3) across, along and height in the station's frame, mm.
+        pane: (N,) whose points are the pane's; the others are the body's.
+        edge: of the pane, across.
+        moves: (P, N, 3) small motions of the points.
+
+    Raises:
+        NoResultError: flange or pane was not seen; names which.
+    """
+    flat = (normals[:, 2] > 0.85) & (points[:, 0] < edge) & (points[:, 0] > edge - _REACH)
+    flange = np.flatnonzero(flat & ~pane)
+    face = np.flatnonzero(flat & pane)
+    for name, index in (("flange", flange), ("pane", face)):
+        if len(index) < _FEWEST:
+            raise NoResultError(f"{len(index)} points on the {name}; to fix: scan it within {_REACH:g} mm of the edge")
+    middle = np.median(points[flange, 0])
+    height, variance, change = -thickness, 0.0, np.zeros(len(moves))
+    for index, sign in ((face, 1.0), (flange, -1.0)):
+        a, s, h = points[index].T
+        design = np.column_stack([a**0, a - middle, s, s**2, (a - middle) ** 2])
+        surface, spread, gain = _robust(design if sign > 0 else design[:, :4], h, points[index, :2])
+        height += sign * surface[0]
+        variance += spread[0, 0]
+        along = np.einsum("pni,ni->pn", moves[:, index], normals[index]) / normals[index, 2]
+        change += sign * along @ gain[0]
+    return float(height), float(variance), change
 
 
 def _meet(surface: Array, wall: Array, rim: float) -> Array:
@@ -148,6 +187,16 @@ class Seam:
     reason: str = ""
     inner: tuple[float, float] | None = None  # its edge: across and outwards in the station's frame
     outer: tuple[float, float] | None = None
+    bond: float = np.nan  # from the pane's inner face to the flange behind it, before the pane is placed
+    sigma_bond: float = np.nan
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A pane that is yet to be placed; its scans lie where it will stand."""
+
+    first: int  # its first scan: those before it show the body
+    thickness: float  # of the glass, mm
 
 
 def measure_seam(
@@ -157,8 +206,9 @@ def measure_seam(
     limits: Limits,
     pose_sigma: float = 0.0,
     errors: PlacingErrors | None = None,
+    pane: Pane | None = None,
 ) -> list[Seam]:
-    """Return flush and gap at each station.
+    """Return flush and gap at each station; and the bond gap where the inner part is a pane to be placed.
 
     Both edges are measured in the same cloud, so the fit of the part only says where to look and which way is across:
     an error of 1° in it changes a gap of 16 mm by 2.4 µm.
@@ -169,7 +219,7 @@ def measure_seam(
             scatter in `errors`.
         errors: how the scans' places may err. What moves both edges alike does not count.
     """
-    return [_measure_station(scan, T_base_part, station, limits, pose_sigma, errors) for station in stations]
+    return [_measure_station(scan, T_base_part, station, limits, pose_sigma, errors, pane) for station in stations]
 
 
 def _measure_station(
@@ -179,6 +229,7 @@ def _measure_station(
     limits: Limits,
     pose_sigma: float,
     errors: PlacingErrors | None,
+    pane: Pane | None,
 ) -> Seam:
     T_station_base = frames.inverse(T_base_part @ station.T_part_station)
     points = frames.transform(T_station_base, scan.points)
@@ -192,9 +243,14 @@ def _measure_station(
     moves = np.zeros((len(modes), *points.shape))
     for k, (index, moved) in enumerate(modes):
         moves[k, index] = frames.rotate(T_station_base, moved)
+    # Of a pane that is placed, what belongs to it shows by the side of the gap alone.
+    of_pane = points[:, 0] < 0 if pane is None else scan.view[near] >= pane.first
+    bond, bond_variance, bond_moved = np.nan, np.nan, np.zeros(len(modes))
     try:
-        inner, inner_spread, inner_moved = _side(points, normals, -1.0, "inner part", moves)
-        outer, outer_spread, outer_moved = _side(points, normals, 1.0, "outer part", moves)
+        inner, inner_spread, inner_moved = _side(points, normals, -1.0, "inner part", moves, of_pane)
+        outer, outer_spread, outer_moved = _side(points, normals, 1.0, "outer part", moves, ~of_pane)
+        if pane is not None:
+            bond, bond_variance, bond_moved = bond_gap(points, normals, of_pane, inner[0], pane.thickness, moves)
     except NoResultError as error:
         return Seam(station.name, reason=str(error))
     gap = float(outer[0] - inner[0])
@@ -214,12 +270,16 @@ def _measure_station(
         verdict=verdict,
         inner=(float(inner[0]), float(inner[1])),
         outer=(float(outer[0]), float(outer[1])),
+        bond=bond,
+        sigma_bond=float(np.sqrt(bond_variance + pose_sigma**2 + bond_moved @ bond_moved)),
     )
 
 
-def _side(points: Array, normals: Array, side: float, name: str, moves: Array) -> tuple[Array, Array, Array]:
+def _side(
+    points: Array, normals: Array, side: float, name: str, moves: Array, own: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
     """Return the edge on one side of the gap's middle: the inner part lies on the negative, its flank looks to +."""
-    here = side * points[:, 0] > 0
+    here = own & (side * points[:, 0] > 0)
     try:
         return find_edge(points[here], normals[here], -side, moves[:, here])
     except NoResultError as error:

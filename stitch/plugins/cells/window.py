@@ -37,6 +37,7 @@ from stitch.plugins.cells.placed_scans import (
     read_placed_session,
     read_scan_table,
     stated_errors,
+    with_part_yet_to_place,
 )
 from stitch.plugins.cells.scan_to_cad import (
     AllowancePrior,
@@ -51,7 +52,7 @@ from stitch.plugins.cells.scan_to_cad import (
     write_deviation_csv,
     write_deviation_ply,
 )
-from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station, measure_seam
+from stitch.plugins.cells.seam import VERDICTS, Limits, Pane, Seam, Station, measure_seam
 from stitch.session.session import Cloud
 
 FIT_FORMAT = "stitch-fit/1"
@@ -59,7 +60,7 @@ SEAM_FORMAT = "stitch-seam/1"
 _SCANS = {"scans", "session", "hand_eye", "errors"}
 _FIT_KEYS = {"format", *_SCANS, "cad", "length_unit", "instances", "tolerance", "cell", "region", "nominal", "path"}
 _FIT_KEYS |= {"coverage"}
-_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
+_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma", "pane"}
 NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
 _SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
 
@@ -95,6 +96,7 @@ class SeamJob:
     limits: Limits
     pose_sigma: float
     file: Path | None = None  # that was read
+    pane: Pane | None = None  # where it is yet to be placed
 
 
 def read_fit_job(file: Path | str) -> FitJob:
@@ -153,6 +155,14 @@ def read_seam_job(file: Path | str) -> SeamJob:
     T_base_part = document.pose("part") if "part" in document else _fitted_pose(document.path("fit"))
     limits = document.table("limits", Limits.__dataclass_fields__)
     placed = _read_scans(document)
+    pane = None
+    if "pane" in document:
+        entries = document.table("pane", ("session", "fit", "thickness"), required=True)
+        pane = Pane(len(placed.names), entries.number("thickness", positive=True))
+        # Both CADs lie in one frame, as the window sits in the body.
+        T = T_base_part @ frames.inverse(_fitted_pose(entries.path("fit")))
+        loose = read_placed_session(entries.path("session"), document.path("hand_eye"))
+        placed = with_part_yet_to_place(placed, loose, T)
     return SeamJob(
         placed=placed,
         scan=assemble_scans(placed),
@@ -161,6 +171,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
         limits=Limits(**{key: limits.number(key, positive="tolerance" in key) for key in limits.entries}),
         pose_sigma=abs(document.number("pose_sigma", 0.0)),
         file=file,
+        pane=pane,
     )
 
 
@@ -339,7 +350,8 @@ def solve_seam(job: SeamJob) -> list[Seam]:
     Raises:
         NoResultError: no station could be measured.
     """
-    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma, job.placed.errors)
+    errors = job.placed.errors
+    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma, errors, job.pane)
     if all(seam.verdict == "not measured" for seam in seams):
         raise NoResultError(f"no station could be measured; the first: {seams[0].reason}")
     return seams
@@ -347,7 +359,9 @@ def solve_seam(job: SeamJob) -> list[Seam]:
 
 def write_seam(seams: list[Seam], file: Path) -> None:
     """Write one row per station."""
-    names = ("station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason")
+    names = ["station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason"]
+    if any(np.isfinite(seam.bond) for seam in seams):
+        names += ["bond", "sigma_bond"]
     write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})
 
 
@@ -474,11 +488,18 @@ def run_seam(file: Path, wanted: Wanted) -> None:
         return
     say(stations_sentence(job.limits, seams))
     rows = [
-        (s.station, "", "", f"{s.verdict}: {s.reason}")
+        (s.station, "", "", *([""] if job.pane else []), f"{s.verdict}: {s.reason}")
         if s.reason
-        else (s.station, f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}", s.verdict)
+        else (
+            s.station,
+            f"{s.flush:+.3f} ± {s.sigma_flush:.3f}",
+            f"{s.gap:.3f} ± {s.sigma_gap:.3f}",
+            *([f"{s.bond:.3f} ± {s.sigma_bond:.3f}"] if job.pane else []),
+            s.verdict,
+        )
         for s in seams
     ]
-    show_table("Stations, ± 1 σ", ("station", "flush / mm", "gap / mm", "verdict"), rows, ("station", "verdict"))
+    columns = ("station", "flush / mm", "gap / mm", *(["bond gap / mm"] if job.pane else []), "verdict")
+    show_table("Stations, ± 1 σ", columns, rows, ("station", "verdict"))
     if wanted.output is not None:
         print(wanted.output)

@@ -22,7 +22,7 @@ from stitch.numerics import frames
 from stitch.plugins.cells.cad import Box, Regions, cad_surface, nearest_partners
 from stitch.plugins.cells.placed_scans import join_scans
 from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
-from stitch.plugins.cells.seam import Limits, Station, find_edge, measure_seam
+from stitch.plugins.cells.seam import Limits, Station, bond_gap, find_edge, measure_seam
 from stitch.plugins.cells.window import correct_path
 from stitch.session.scan import prepare_scan
 from tests.command_line import ended
@@ -188,6 +188,23 @@ def test_the_sigma_of_an_edge_does_not_count_noise_twice_where_the_surface_is_th
     sigmas = [np.sqrt(find_edge(points + height, normals, 1.0)[1][1, 1]) for height in heights]
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.1)
     assert sigmas[0] == pytest.approx(0.04 * 3 / np.sqrt(3000), rel=0.4)  # of a parabola's end
+
+
+def test_bond_gap_is_from_the_glass_inner_face_to_the_flange_behind_it_and_follows_the_pane():
+    """Pane 4 mm thick, its outer face at 0.3; flange at −12 leaned by 0.02: 8.3 mm less the lean where both are seen."""
+    rng = np.random.default_rng(2)
+    places = rng.uniform([-28, -10], [-8, 10], (4000, 2))
+    of_pane = np.arange(4000) < 2000
+    places[~of_pane, 0] = rng.uniform(-20, 8, 2000)
+    height = np.where(of_pane, 0.3, -12 + 0.02 * places[:, 0]) + 0.05 * rng.standard_normal(4000)
+    normals = np.tile([0, 0, 1.0], (4000, 1))
+    moves = np.where(of_pane[:, None], [0, 0, 0.1], 0.0)[None]
+    bond, variance, moved = bond_gap(np.column_stack([places, height]), normals, of_pane, -8.0, 4.0, moves)
+    assert bond == pytest.approx(8.3 + 0.02 * 14, abs=4 * np.sqrt(variance))
+    assert np.sqrt(variance) < 0.01
+    assert moved == pytest.approx([0.1])
+    with pytest.raises(NoResultError, match="0 points on the flange"):
+        bond_gap(np.column_stack([places, height]), normals, np.ones(4000, bool), -8.0, 4.0, moves)
 
 
 def test_seam_at_eight_stations(door, pane):
