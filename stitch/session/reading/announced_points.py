@@ -1,5 +1,5 @@
 """How many points a scan's header announces, asked before a library makes room for them: LAS, E57, EXR, HDF5; and how
-large the arrays of MATLAB and NumPy are that are to hold poses.
+large the arrays of MATLAB and NumPy and the sheets of a workbook are that are to hold poses.
 
 Layouts: LAS 1.4 R15 (ASPRS), tables 3 and 4; ASTM E2807, clause 6; OpenEXR, "The OpenEXR file layout".
 """
@@ -8,6 +8,7 @@ import re
 import struct
 import zipfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import InputError
@@ -28,6 +29,9 @@ _EXR_HEADER = 1 << 20
 # Poses of a million views.
 _MOST_BYTES = 200_000_000
 _MAT_HEADER, _MAT_PACKED = 128, 15
+# A sheet is read as a rectangle up to its last filled cell; 20 columns for a million rows.
+_MOST_CELLS = 20_000_000
+_FILLED_CELL = re.compile(rb"<(?:\w+:)?c\s(?:[^>]*?\s)?r=[\"']([A-Z]{1,3})(\d{1,7})[\"'][^>]*(?<!/)>")
 _EXR_WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
 
 
@@ -97,9 +101,44 @@ def require_array_room(path: Path) -> None:
     Raises:
         InputError: with how many bytes are announced; what is no such file is left to its reader.
     """
-    count = {".mat": _mat_bytes, ".npz": _npz_bytes}.get(path.suffix.lower())
+    count = {".mat": _mat_bytes, ".npz": _zip_bytes}.get(path.suffix.lower())
     if count is not None and (announced := count(path)) > _MOST_BYTES:
         raise InputError(f"{path}: {announced} bytes of arrays announced; to fix: save the poses alone")
+
+
+def require_workbook_room(path: Path) -> None:
+    """Refuse a workbook whose sheets take more room than tables of poses do, before it is made.
+
+    One number in the last cell of an empty sheet makes 17 billion cells of it, and no reader that asks for so much
+    memory comes back.
+
+    Raises:
+        InputError: with how much is announced; what is no archive is left to its reader.
+    """
+    if (unpacked := _zip_bytes(path)) > _MOST_BYTES:
+        raise InputError(f"{path}: {unpacked} bytes of sheets announced; to fix: save the poses alone, as CSV")
+    # A damaged archive is left to its reader too.
+    with suppress(zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, zlib.error, EOFError):
+        with zipfile.ZipFile(path) as archive:
+            sheets = [name for name in archive.namelist() if name.startswith("xl/worksheets/")]
+            cells = max((_cells(archive.read(name)) for name in sheets), default=0)
+        if cells > _MOST_CELLS:
+            raise InputError(f"{path}: {cells} cells up to the last filled one; to fix: save the poses alone, as CSV")
+
+
+def _cells(sheet: bytes) -> int:
+    """Cells of the rectangle that ends at the last filled row and column of a sheet of Office Open XML."""
+    letters = set[bytes]()
+    rows = 0
+    for cell in _FILLED_CELL.finditer(sheet):
+        letters.add(cell[1])
+        rows = max(rows, int(cell[2]))
+    return rows * max((_column(name) for name in letters), default=0)
+
+
+def _column(letters: bytes) -> int:
+    """The number of a column: A is 1, AA is 27."""
+    return sum((letter - ord("A") + 1) * 26**place for place, letter in enumerate(reversed(letters)))
 
 
 def _mat_bytes(path: Path) -> int:
@@ -123,7 +162,7 @@ def _mat_bytes(path: Path) -> int:
     return max(total, size)
 
 
-def _npz_bytes(path: Path) -> int:
+def _zip_bytes(path: Path) -> int:
     try:
         with zipfile.ZipFile(path) as archive:
             return sum(entry.file_size for entry in archive.infolist())

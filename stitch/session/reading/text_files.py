@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stitch.errors import InputError
+from stitch.session.reading.announced_points import require_workbook_room
 from stitch.system.packages import import_extra
 
 # Tables and descriptions are far smaller; a larger one is another file.
@@ -218,9 +219,10 @@ def workbook_sheets(file: Path) -> dict[str, str]:
     """Return the sheets of a spreadsheet that hold something as CSV, by their names.
 
     Raises:
-        InputError: no such file, or no workbook; the package that reads them is not installed.
+        InputError: no such file, no workbook, or a larger one than tables are; the package that reads them is missing.
     """
     require_file(file, "name a workbook")
+    require_workbook_room(file)
     calamine = import_extra("python_calamine", file, "formats")
     try:
         book = calamine.CalamineWorkbook.from_path(str(file))

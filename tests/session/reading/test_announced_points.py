@@ -4,6 +4,7 @@ import struct
 import time
 import zipfile
 import zlib
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from stitch.session.reading.announced_points import (
     require_exr_room,
     require_las_room,
     require_room,
+    require_workbook_room,
 )
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.scan_files import ptx_scans
@@ -130,6 +132,23 @@ def test_arrays_that_are_packed_a_thousand_times_are_refused_before_they_are_unp
     np.savez_compressed(tmp_path / "small.npz", T=small)
     require_array_room(tmp_path / "small.mat")
     require_array_room(tmp_path / "small.npz")
+
+
+@pytest.mark.parametrize(
+    ("cells", "padding", "message"),
+    [
+        ('<c r="A1"><v>1</v></c><c t="n" r="XFD1048576"><v>1</v></c>', 0, "17179869184 cells"),
+        ("<x:c r='ZZ1048576'><v>1</v></x:c><c r='A1'><v>1</v></c>", 0, "736100352 cells"),
+        ('<c r="A1"><v>1</v></c>', 201_000_000, "bytes of sheets announced"),
+        ('<c r="T1000000"><v>1</v></c><c r="XFD1048576" s="1"/>', 0, None),
+    ],
+)
+def test_a_workbook_that_fills_the_memory_is_refused_before_it_is_read(tmp_path, cells, padding, message):
+    file = tmp_path / "poses.xlsx"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/worksheets/sheet1.xml", f"<sheetData><row>{cells}</row></sheetData>" + " " * padding)
+    with pytest.raises(InputError, match=message) if message else nullcontext():
+        require_workbook_room(file)
 
 
 def test_what_a_file_can_hold_passes(tmp_path):
