@@ -19,8 +19,6 @@ _HEAVY = (
     "matplotlib",
     "trimesh",
     "libigl",
-    "scikit-fem",
-    "manifold3d",
     "jsonschema",
 )
 _CELL = ("synth", "blade", "--views", "6", "--seed", "3")

@@ -27,7 +27,8 @@ def plan_views(scene: Scene, mesh: trimesh.Trimesh, views: int, rng: np.random.G
     Raises:
         NoResultError: a view that the arm cannot reach or that sees too little, after many tries.
     """
-    q, rail, joints, velocity = scene.arm.home, [], [], []
+    q, rail, velocity = scene.arm.home, [], []
+    joints: list[Array] = []
     for view in range(views):
         for _attempt in range(_ATTEMPTS):
             T_part_scanner = _pose(scene.plan, scene.scanner, mesh, view, rng)

@@ -49,8 +49,8 @@ def build(plate: DrillPlate = DrillPlate()) -> trimesh.Trimesh:
     for place in places:
         outline -= circle(plate.hole_diameter / 2, place, plate.hole_sides)
     solid = extrude(outline, -plate.thickness, 0.0)
-    if plate.radius is not None:
-        solid = warp(refined(solid, plate.facet), lambda points: _bend(points, plate.radius))
+    if (radius := plate.radius) is not None:
+        solid = warp(refined(solid, plate.facet), lambda points: _bend(points, radius))
     return to_mesh(solid)
 
 

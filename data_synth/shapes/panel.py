@@ -58,7 +58,7 @@ def build(panel: Panel = Panel()) -> trimesh.Trimesh:
 def positions(extent: float, pitch: float) -> Array:
     """Places of stringers or frames in mm: as many as fit at the pitch, centred."""
     count = max(1, int(extent // pitch))
-    return pitch * (np.arange(count) - (count - 1) / 2)
+    return pitch * (np.arange(0.0, count) - (count - 1) / 2)
 
 
 def _hat(panel: Panel) -> CrossSection:

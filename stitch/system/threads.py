@@ -63,6 +63,11 @@ def _pool() -> ThreadPoolExecutor:
     )
 
 
+# A process that is forked has the pool of its parent without its threads, and would wait for them for ever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 def share_cores(processes: int) -> None:
     """Leave the cores to so many processes like this one, before the first `parallel`."""
     global _processes

@@ -63,7 +63,7 @@ def running_over() -> bool:
 
 def _start_watch() -> None:
     global _watch
-    if _watch is not None:
+    if _watch is not None and _watch.is_alive():  # in a process that was forked it is not
         return
     _watch = threading.Thread(target=_check_calls, name="stitch-time-limit", daemon=True)
     if _ALARM is not None and threading.current_thread() is threading.main_thread():

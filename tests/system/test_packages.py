@@ -136,7 +136,9 @@ def test_a_package_that_states_no_licence_is_told():
 def test_all_packages_that_are_asked_for_are_listed_with_what_they_are_for():
     extras = {name: asked for name, asked in EXTRAS.items() if name not in ("dev", "docs")}
     asked = {name_of(r) for requirements in (PROJECT["dependencies"], *extras.values()) for r in requirements}
-    assert set(PACKAGES) == asked - {"open3d-cpu"}
+    assert set(PACKAGES) == asked - {"open3d-cpu", DISTRIBUTION}
+    assert EXTRAS["all"] == [f"{DISTRIBUTION}[{','.join(name for name in extras if name not in ('all', 'open3d'))}]"]
+    del extras["all"]
     for extra, requirements in extras.items():
         assert {command_of(name_of(r)) for r in requirements} <= {
             command_for(extra),

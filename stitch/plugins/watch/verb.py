@@ -50,8 +50,7 @@ def batch(
 
     Args:
         sessions: in memory, or folders that the workers can read.
-        client: what has `submit`: a `concurrent.futures` pool or a Dask client; None: this process. Processes that are
-            forked wait for ever for threads of this one: make a pool by multiprocessing.get_context("spawn").
+        client: what has `submit`: a `concurrent.futures` pool or a Dask client; None: this process.
         effects, keep: as of `stitch.run`.
 
     Returns:

@@ -236,8 +236,10 @@ def test_before_and_after_are_of_the_same_pairs():
     assert run_batch.row_of_document(document, "s", "s", U=None).steps_um == (10.0, 30.0, None)
 
 
-def test_a_pool_of_any_kind_hands_back_runs(sessions):
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+@pytest.mark.parametrize("begins", ["spawn", "fork"])
+def test_a_pool_of_any_kind_hands_back_runs(sessions, begins):
+    stitch_batch(sessions[:1])  # with threads of this process, which forked ones lack
+    with ProcessPoolExecutor(2, mp_context=get_context(begins)) as pool:
         found = stitch_batch([*sessions, "nowhere"], pool)
     assert [run.session.name for run in found.runs[:2]] == ["monday", "tuesday"]
     assert found.runs[2] is None and "nowhere/session.toml" in found.errors["nowhere"]
