@@ -5,6 +5,7 @@ install, it with NumPy 1.26, and one where an open3d is. Then each heavy package
 """
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -45,6 +46,8 @@ def main() -> None:
         kinds = [(python, "bare") for python in pythons]
         for number, (python, kind) in enumerate([*kinds, *((pythons[0], kind) for kind in list(_KINDS)[1:])]):
             print(_row(python, kind, folder / f"env{number}", wheel, made), flush=True)
+            if number:
+                shutil.rmtree(folder / f"env{number}")
         print("\n| without | the line |\n|---|---|", flush=True)
         for package in _HEAVY:
             print(f"| {package} | {_without(folder / 'env0', package, made)} |", flush=True)
