@@ -1,6 +1,7 @@
 """Options that several commands share."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +31,11 @@ def complete_effect(incomplete: str) -> list[str]:
 
     before, comma, begun = incomplete.rpartition(",")
     return [f"{before}{comma}{name}" for name in EFFECTS if name.startswith(begun)]
+
+
+def completes(*names: str) -> Callable[[str], list[str]]:
+    """Return what ends a word that begins as one of these names do, for the tab key of a shell."""
+    return lambda incomplete: [name for name in names if name.startswith(incomplete)]
 
 
 def split_names(text: str | None) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from stitch.cli.options import (
     Trust,
     bytes_of,
     complete_effect,
+    completes,
     require_tolerance,
     split_names,
 )
@@ -58,7 +59,12 @@ _Effects = Annotated[
 _Keep = Annotated[bool, typer.Option("--keep", help="Fuse also the views that do not belong.")]
 _Register = Annotated[
     str | None,
-    typer.Option("--register", metavar="METHOD", help="How single views are registered: dpwvm (usual), gicp or vmm."),
+    typer.Option(
+        "--register",
+        metavar="METHOD",
+        help="How single views are registered: dpwvm (usual), gicp or vmm.",
+        autocompletion=completes("dpwvm", "gicp", "vmm"),
+    ),
 ]
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
 _Mesh = Annotated[
@@ -67,6 +73,7 @@ _Mesh = Annotated[
         "--mesh",
         metavar="[watertight|light]",
         help="Also write mesh.ply: open where nobody looked, closed (watertight), or a tenth of it (light).",
+        autocompletion=completes("watertight", "light"),
     ),
 ]
 _Follow = Annotated[bool, typer.Option("--follow", help="Judge each view as it arrives in the folder, then run.")]

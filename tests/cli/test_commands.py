@@ -82,6 +82,7 @@ def test_version_is_the_package_s(capsys):
     [
         ("stitch ex", ["explain", "export"]),
         pytest.param("stitch calibrate sp", ["sphere"], marks=pytest.mark.slow),
+        pytest.param("stitch export r --to ar", ["arm-dh", "arm-urdf"], marks=pytest.mark.slow),
         pytest.param("stitch run --eff", ["--effects", "--effects-file"], marks=pytest.mark.slow),
     ],
 )

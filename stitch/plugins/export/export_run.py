@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
+from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, completes, require_new
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, results_stream, say, show_table, stdout_for_results
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 from stitch.plugins.export.formats import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
 if TYPE_CHECKING:
@@ -28,7 +28,11 @@ _LISTED_TARGETS = 40
 _NEGLIGIBLE_MOVE = 1e-6
 
 _KINDS = f"hand-eye: {', '.join(HAND_EYE)}; arm: {', '.join(ARM)}; cloud: {', '.join(CLOUD)}"
-_To = Annotated[str | None, typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.")]
+_FORMATS = (*HAND_EYE, *ARM, *CLOUD)
+_To = Annotated[
+    str | None,
+    typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.", autocompletion=completes(*_FORMATS)),
+]
 _Program = Annotated[
     Path | None, typer.Option("--program", metavar="FILE", help="Move the targets of a KUKA, FANUC, ABB or UR program.")
 ]
@@ -101,8 +105,8 @@ def export_run(
     if (to is None) == (program is None):
         raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
     require_new(output)
-    if program is None and to not in (*HAND_EYE, *ARM, *CLOUD):
-        raise InputError(f"--to {to}: to fix: one of {_KINDS}")
+    if program is None and to not in _FORMATS:
+        raise InputError(f"--to {to}: no such format{did_you_mean(str(to), _FORMATS)}; to fix: one of {_KINDS}")
     if program is not None and (run / "fit.json").is_file():
         _export_moved_program(program, run / "fit.json", output, frame, part=part, as_json=as_json)
     elif program is not None:

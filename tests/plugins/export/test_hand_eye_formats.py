@@ -192,7 +192,8 @@ def test_what_an_unseen_effect_could_do_leaves_with_the_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--to", "lego"], "--to lego: to fix: one of hand-eye: ros, urdf"),
+        (["--to", "lego"], "--to lego: no such format; to fix: one of hand-eye: ros, urdf"),
+        (["--to", "rso"], "--to rso: no such format; did you mean 'ros'?; to fix: one of"),
         (["--to", "ros", "--parent", "my flange"], "--parent 'my flange': to fix"),
         (["--to", "ros", "-o", "taken.yaml"], "taken.yaml: exists already"),
         (["--to", "ros", "-o", "no/scanner.yaml"], "no/scanner.yaml: there is no folder no; to fix: make it"),
