@@ -63,9 +63,14 @@ def _pool() -> ThreadPoolExecutor:
     )
 
 
-# A process that is forked has the pool of its parent without its threads, and would wait for them for ever.
+def _forget_threads() -> None:
+    """A process that is forked knows threads of its parent, ours and those of OpenMP; it would wait for them for ever."""
+    _pool.cache_clear()
+    threadpool_limits(1, user_api="openmp")
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_forget_threads)
 
 
 def share_cores(processes: int) -> None:

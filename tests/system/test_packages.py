@@ -147,6 +147,14 @@ def test_all_packages_that_are_asked_for_are_listed_with_what_they_are_for():
         }
 
 
+def test_the_image_is_made_by_the_commands_of_the_readme():
+    command, environment = re.findall(
+        r"^(make \w+|\. [\w./]+)(?: .*)?$", (ROOT / "README.md").read_text("utf-8"), re.MULTILINE
+    )[:2]
+    image = (ROOT / "examples/fleet/Dockerfile").read_text("utf-8")
+    assert f"\nRUN {command}" in image and f"PATH=/stitch/{environment[2:].removesuffix('/activate')}:" in image
+
+
 def test_open3d_is_no_dependency_of_the_base():
     assert not [r for r in PROJECT["dependencies"] if r.startswith("open3d")]
     assert command_of("open3d") == command_for("open3d")
