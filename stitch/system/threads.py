@@ -64,7 +64,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _forget_threads() -> None:
-    """A process that is forked knows threads of its parent, ours and those of OpenMP; it would wait for them for ever."""
+    """A forked process knows threads of its parent, ours and those of OpenMP, and would wait for them for ever."""
     _pool.cache_clear()
     threadpool_limits(1, user_api="openmp")
 
