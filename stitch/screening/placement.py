@@ -117,8 +117,9 @@ def shows_no_surface(scan: Scan) -> bool:
 
 def lies_in_a_line(scan: Scan) -> bool:
     """Return True for a scan of points in a straight line: on a flat part it lies on the surface, and holds nothing."""
-    extent = np.linalg.svd(scan.points - scan.points.mean(axis=0), compute_uv=False)
-    return bool(extent[1] < _LINE * extent[0])
+    centred = scan.points - scan.points.mean(axis=0)
+    squares = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(squares[1] < _LINE**2 * squares[2])
 
 
 def evaluate_placement(scan: Scan, T: Array, surface: ReferenceSurface) -> Placement:
