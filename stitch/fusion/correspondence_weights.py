@@ -132,10 +132,17 @@ def class_scale(e: Array, scale: float) -> float:
 
     Flying points, flash and the far side of a thin edge all stand on one side; the other side shows the scatter.
     """
-    classes = [side for side in (e[e > 0], -e[e < 0]) if len(side) >= _CLASS]
-    if not classes:
+    # In one order the middles of both classes are at hand.
+    e = np.sort(e)
+    above, below = len(e) - np.searchsorted(e, 0.0, side="right"), np.searchsorted(e, 0.0)
+    middles = [
+        abs(e[[first + (count - 1) // 2, first + count // 2]].mean())
+        for first, count in ((len(e) - above, above), (0, below))
+        if count >= _CLASS
+    ]
+    if not middles:
         return scale
-    cleaner = MAD_TO_SIGMA * min(float(np.median(side)) for side in classes)
+    cleaner = MAD_TO_SIGMA * float(min(middles))
     return float(np.sqrt((len(e) * cleaner**2 + _POOLED * scale**2) / (len(e) + _POOLED)))
 
 

@@ -103,7 +103,7 @@ class PoseStep:
 
 def step_columns(model: ViewModel, start: int, moved: str) -> Array:
     """(n, 6) of a displacement that views from `start` on have in common."""
-    return (model.views if moved == "part" else model.mounts)[start:].sum(axis=0)
+    return np.asarray((model.views_onwards if moved == "part" else model.mounts_onwards)[start])
 
 
 @dataclass(frozen=True)

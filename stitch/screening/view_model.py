@@ -29,7 +29,7 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import f_limit, f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.kernels import process_covariance
-from stitch.numerics.least_squares import column_space, equilibrated
+from stitch.numerics.least_squares import column_space, equilibrated, invert_covariance
 from stitch.numerics.reml import MixedModel, VarianceFit, fit_variances
 from stitch.observations.linear_model import with_pose_errors
 from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, drift_kernel, prior_pose_errors, usual_twist
@@ -110,6 +110,16 @@ class ViewModel:
         return self._by_view @ self.mount_jacobians
 
     @cached_property
+    def views_onwards(self) -> Array:
+        """(V, n, 6) response to a left twist that each view and all after it have in common, rotations in 1/lever."""
+        return np.cumsum(self.views[::-1], axis=0)[::-1]
+
+    @cached_property
+    def mounts_onwards(self) -> Array:
+        """(V, n, 6) the same to a correction of their hand-eye, rad and length_unit."""
+        return np.cumsum(self.mounts[::-1], axis=0)[::-1]
+
+    @cached_property
     def _by_view(self) -> Array:
         """(V, n, 6) response to a left twist of one view, rad and length_unit."""
         return self.reduced.reduction.reshape(-1, self.count, 6).transpose(1, 0, 2)
@@ -188,11 +198,10 @@ def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) 
     """Return P for variances that were fitted, with further columns (n, K) in the mean."""
     mixed = model.mixed(further)
     A = mixed.A[0]
-    C = mixed.covariance(fit.variances)[0]
-    both = np.linalg.solve(C, np.column_stack([A, np.eye(len(C))]))
-    CA, inverse = both[:, : A.shape[1]], both[:, A.shape[1] :]
+    inverse = invert_covariance(mixed.covariance(fit.variances)).matrix[0]
+    CA = inverse @ A
     P = inverse - CA @ np.linalg.solve(A.T @ CA, CA.T)
-    return Projector(P, P @ model.z, len(C) - A.shape[1])
+    return Projector(P, P @ model.z, len(P) - A.shape[1])
 
 
 @dataclass(frozen=True)

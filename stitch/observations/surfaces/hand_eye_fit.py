@@ -62,6 +62,11 @@ class Repeatability(Value):
     translation: float  # length_unit
     noise_factor: float
 
+    @property
+    def variances(self) -> Array:
+        """(3,) of rotation and translation, and the noise factor."""
+        return np.array([self.rotation**2, self.translation**2, self.noise_factor])
+
 
 @dataclass(frozen=True)
 class ReducedPoses:
@@ -157,7 +162,8 @@ class RigModel:
         R = block_diag(*(r.reduction for r in reduced))
         components = np.array([*white, *(R @ C @ R.T for C in errors.components)])
         shared = block_diag(*(e.common_columns @ e.common_columns.T for e in self.parts))[None]
-        mixed = MixedModel(self.z[None], mean_basis(self.columns)[None], components[:, None], further=errors.prior)
+        further = errors.prior if errors.names else None
+        mixed = MixedModel(self.z[None], mean_basis(self.columns)[None], components[:, None], further=further)
         return replace(mixed, fixed=shared) if shared.any() else mixed
 
     def reduce(self, twists: Sequence[Array]) -> Array:
@@ -270,7 +276,9 @@ def _variance_sources(
     """Return what each source does to the covariance (6 + P, 6 + P)."""
     rig, gls = solution.rig, solution.gls
     mixed = rig.mixed(errors)
-    fit = fit_variances(mixed, both_starts=True)
+    # White scatter alone was found with the answer.
+    start = None if errors.names else solution.scatter[0].variances
+    fit = fit_variances(mixed, start=start, both_starts=True)
     mean = fit.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, fit)
     components = zip((*WHITE_COMPONENTS, *errors.names), mean, mixed.components[:, 0], strict=True)
     sources = {name: variance * gls.gain @ C @ gls.gain.T for name, variance, C in components}
