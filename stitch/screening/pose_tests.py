@@ -98,12 +98,7 @@ class PoseStep:
 
     def columns(self, model: ViewModel) -> Array:
         """(n, 6) of the displacement."""
-        return step_columns(model, self.start, self.moved)
-
-
-def step_columns(model: ViewModel, start: int, moved: str) -> Array:
-    """(n, 6) of a displacement that views from `start` on have in common."""
-    return np.asarray((model.views_onwards if moved == "part" else model.mounts_onwards)[start])
+        return np.asarray(model.steps[self.moved][self.start])
 
 
 @dataclass(frozen=True)
@@ -295,7 +290,7 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
         return None
     every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
     starts = [k for k in every if k not in [k for starts in taken for k in starts.values()]]
-    steps = {(moved, k): step_columns(model, k, moved) for moved in MOVED_BODIES for k in starts}
+    steps = {(moved, k): model.steps[moved][k] for moved in MOVED_BODIES for k in starts}
     more = {at: displaced for at, displaced in steps.items() if says_more(displaced)}
     tests = dict(zip(more, test_alternatives(under, list(more.values())), strict=True))
     view = min(alone, key=lambda v: alone[v].rank)
@@ -319,12 +314,12 @@ def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody
         best: the view from which on each of the two would have moved.
         tests: how many steps were looked at.
     """
-    with_step = {moved: hstack_columns(columns, step_columns(model, best[moved], moved)) for moved in MOVED_BODIES}
+    with_step = {moved: hstack_columns(columns, model.steps[moved][best[moved]]) for moved in MOVED_BODIES}
     deviance = {moved: model.deviance(with_step[moved]) for moved in MOVED_BODIES}
     likelier = min(MOVED_BODIES, key=lambda moved: deviance[moved])
     distinguishable = bool(abs(deviance["part"] - deviance["scanner"]) > _DISTINGUISHABLE_DEVIANCE)
     start = best[likelier]
-    displaced = step_columns(model, start, likelier)
+    displaced = model.steps[likelier][start]
     p = test_alternative(projector(model, model.fit(columns), columns), displaced).p_value * tests
     under = projector(model, model.fit(with_step[likelier]), columns)
     tested = test_alternative(under, displaced)

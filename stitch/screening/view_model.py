@@ -110,14 +110,13 @@ class ViewModel:
         return self._by_view @ self.mount_jacobians
 
     @cached_property
-    def views_onwards(self) -> Array:
-        """(V, n, 6) response to a left twist that each view and all after it have in common, rotations in 1/lever."""
-        return np.cumsum(self.views[::-1], axis=0)[::-1]
-
-    @cached_property
-    def mounts_onwards(self) -> Array:
-        """(V, n, 6) the same to a correction of their hand-eye, rad and length_unit."""
-        return np.cumsum(self.mounts[::-1], axis=0)[::-1]
+    def steps(self) -> dict[str, Array]:
+        """By the body that moves, (V, n, 6) response to a displacement that each view and all after it have in common:
+        of the part as `views`, of the scanner as `mounts`."""
+        return {
+            moved: np.cumsum(of_views[::-1], axis=0)[::-1]
+            for moved, of_views in (("part", self.views), ("scanner", self.mounts))
+        }
 
     @cached_property
     def _by_view(self) -> Array:
