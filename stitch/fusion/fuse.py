@@ -34,7 +34,7 @@ from stitch.numerics.frames import Array, Indices, Mask
 from stitch.run_data import FusedCloud, Unsupported
 from stitch.session.capture import Capture
 from stitch.session.measurement import MIN_COSINE, Measurement, intensity_scale
-from stitch.session.scan import Scan, box_corners
+from stitch.session.scan import Scan, box_corners, centroid
 from stitch.session.session import Cloud, SessionData, WholeCloud
 from stitch.system.threads import map_parts, parallel
 
@@ -154,10 +154,12 @@ def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
     Which way an axis points makes no other cells; that it is told by the third moment keeps their order.
     """
     points = np.concatenate([frames.transform(T, scan.points) for scan, T in zip(scans, poses, strict=True)])
-    middle = points.mean(axis=0)
+    middle = centroid(points)
     points -= middle
     _, axes = np.linalg.eigh(points.T @ points)
-    skew = ((points @ axes) ** 3).sum(axis=0)
+    along = points @ axes
+    # A library's power of three takes ten times as long.
+    skew = (along * along * along).sum(axis=0)
     axes = axes * np.where(skew < 0, -1.0, 1.0)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     return frames.make(axes, middle)
