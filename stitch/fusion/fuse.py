@@ -23,7 +23,6 @@ from stitch.fusion.support import (
     cell_numbers,
     edge_credit,
     find_support,
-    number_groups,
     pack_cells,
     weighted_sums,
 )
@@ -190,9 +189,9 @@ def _columns(rows: _Voxels | PlacedPoints) -> tuple[Array, ...]:
 
 def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
     """Return the voxels of points of any views, given the cell of each (N,)."""
-    different, at = number_groups(cells)
+    different, at = np.unique(cells, return_inverse=True)
     views = int(placed.view.max(initial=0)) + 1
-    keys, at = number_groups(at * views + placed.view)
+    keys, at = np.unique(at * views + placed.view, return_inverse=True)
     weight = np.bincount(at, placed.weight).astype(float, copy=False)
     points = weighted_sums(at, placed.weight, placed.points) / weight[:, None]
     normals = weighted_sums(at, placed.weight, placed.normals) / weight[:, None]
@@ -201,7 +200,7 @@ def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
 
 def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
     """Return the mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
-    _, at = number_groups(voxels.cell)
+    _, at = np.unique(voxels.cell, return_inverse=True)
     weight = np.bincount(at, voxels.weight)
     points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
     normals = weighted_sums(at, voxels.weight, voxels.normals)
@@ -311,7 +310,7 @@ class _ViewInSlabs:
         cells = self.slabs.cells(placed)
         if in_memory is None:
             return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
-        different, at = number_groups(pack_cells(cells, axis))
+        different, at = np.unique(pack_cells(cells, axis), return_inverse=True)
         count = np.bincount(at, minlength=len(different))
         mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
         nearest = self._nearest(mean, count)
@@ -384,7 +383,7 @@ class _ViewInSlabs:
     def _nearest(self, mean: Array, count: Indices) -> Indices:
         """(G,) the point in memory that is nearest to the block in which a voxel lies."""
         cells = [c // self.slabs.block for c in self.slabs.cells(mean.T)]
-        different, at = number_groups(pack_cells(cells, self.slabs.axis))
+        different, at = np.unique(pack_cells(cells, self.slabs.axis), return_inverse=True)
         middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]
         _, index = self.tree.query(frames.transform(frames.inverse(self.T), middle), k=1)
         return self.surface[index][at]

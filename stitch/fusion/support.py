@@ -118,22 +118,6 @@ def pack_cells(cells: Sequence[Indices], axis: int) -> Indices:
     return (first << 2 * _BITS) | (second << _BITS) | third
 
 
-def number_groups(key: Indices) -> tuple[Indices, Indices]:
-    """The different keys in their order (G,), and the number of its own for each (N,)."""
-    # np.unique does the same in six times the time: keys of a scan come in runs, which a stable sort merges.
-    order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    new = np.ones(len(key), bool)
-    new[1:] = ordered[1:] != ordered[:-1]
-    different = ordered[new]
-    del ordered
-    number = np.cumsum(new)
-    number -= 1
-    at = np.empty(len(key), np.int64)
-    at[order] = number
-    return different, at
-
-
 def weighted_sums(group: Indices, weight: Array, values: Array) -> Array:
     """(G, k) weighted sums of values (N, k) over the groups (N,) of their rows."""
     return np.stack([np.bincount(group, weight * column) for column in values.T], axis=1)
@@ -147,7 +131,7 @@ def edge_credit(junk: float) -> float:
 def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     """Points in whose cell another view shows the same surface (N,), and the scatter of views across it."""
     views = int(placed.view.max()) + 1
-    _, at = number_groups(cell_numbers(placed.points, cell))
+    _, at = np.unique(cell_numbers(placed.points, cell), return_inverse=True)
     weight = np.bincount(at, placed.weight)
     mean = weighted_sums(at, placed.weight, placed.points)
     mean /= weight[:, None]
@@ -163,7 +147,7 @@ def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     off = np.abs(off)
     alike = cosine > _ALIKE
     del cosine, mean, normal
-    groups, group = number_groups(at * views + placed.view)
+    groups, group = np.unique(at * views + placed.view, return_inverse=True)
     views_in_cell = np.bincount(groups // views, minlength=len(weight))
     several = placed.usable & (views_in_cell > 1)[at]
     scatter = MAD_TO_SIGMA * float(np.median(off[several])) if several.any() else 0.0

@@ -29,7 +29,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.fusion.correspondence_weights import OffsetSums
 from stitch.fusion.register import prior_precision, with_free_mean
-from stitch.fusion.support import cell_numbers, number_groups
+from stitch.fusion.support import cell_numbers
 from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.distributions import mad_sigma, tukey
@@ -423,4 +423,4 @@ def _region(places: Array, e: Array, thickness: float, sigma: float) -> tuple[fl
 def _patches(scan: Scan, index: Indices) -> Indices:
     """Return (M,) numbers of the patches of a scan in which some of its points lie."""
     edge = float(np.ptp(scan.box, axis=0).max()) / _PATCHES
-    return number_groups(cell_numbers(scan.points.take(index, axis=0) - scan.box[0], edge))[1]
+    return np.unique(cell_numbers(scan.points.take(index, axis=0) - scan.box[0], edge), return_inverse=True)[1]

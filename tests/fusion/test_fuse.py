@@ -17,7 +17,7 @@ from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.fusion.fuse import RegisteredSession, fuse, fuse_every_point, part_axes, place_scans
 from stitch.fusion.look_through import range_images
-from stitch.fusion.support import cell_numbers, find_support, number_groups
+from stitch.fusion.support import cell_numbers, find_support
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
 from stitch.numerics import frames
@@ -236,9 +236,9 @@ def test_places_that_need_not_be_asked_are_none_that_a_view_speaks_of(seen_from_
 
 
 @pytest.mark.parametrize("size", [0.3, 7.0])
-def test_cells_and_groups_are_those_of_numpy(size):
+def test_numbers_of_cells_tell_cells_apart_and_keep_their_order(size):
     points = np.random.default_rng(2).normal(0, 20, (500, 3))
     cells = cell_numbers(points, size)
     expected = np.unique(np.floor(points / size), axis=0, return_inverse=True)[1]
-    different, at = number_groups(cells)
+    different, at = np.unique(cells, return_inverse=True)
     assert np.array_equal(at, np.ravel(expected)) and np.array_equal(different[at], cells)
