@@ -3,9 +3,9 @@ of known truth, by a simulator that shares no code with the model.
 
 FEATURES: a clean cell; a compliance of the joints that is in the model; an arm that is a little wrong in every joint
 and link; a scanner with smooth errors over field and incidence, each half as large as its noise; one whose smooth
-errors are new in each scan. All have the small errors that every simulated cell has. MONTE_CARLO puts its spread over
-that of propagation. Used up: 20000 to 20223, 30000 to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to
-46019.
+errors are new in each scan. All have the small errors that every simulated cell has. SOURCES holds each part of the
+budget against what it truly does. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000
+to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019, 46200 to 46239.
 
 CERTIFICATES: the hand-eye from one day and the artefact on another, at other poses: clean cells, and arms that are a
 little wrong in every joint and link; all scanners have smooth errors that are new in each scan. The hand-eye of the
@@ -24,7 +24,7 @@ import trimesh
 from scipy.stats import beta
 
 from bench.harness import Row, Table, markdown, share
-from data_synth import kinematics
+from data_synth import kinematics, nature
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.ordinary_arm import draw_arm
@@ -36,13 +36,14 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.result_document import model_of
-from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, monte_carlo
-from stitch.plugins.metrology.error_sources import place_errors
+from stitch.plugins.metrology import error_sources as of
+from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, monte_carlo, number_table
+from stitch.plugins.metrology.error_sources import error_chain, place_errors
 from stitch.plugins.metrology.feature_file import FeatureList
 from stitch.plugins.metrology.features import Feature
-from stitch.plugins.metrology.place_errors import PlaceErrors
+from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
 from stitch.plugins.metrology.verification import Verification, verify
-from stitch.run_data import HandEyeTransfer
+from stitch.run_data import HandEyeTransfer, RunData
 
 NEW_IN_EACH = "smooth errors new in each scan"
 ARM_AND_NEW = f"ordinary arm, {NEW_IN_EACH}"
@@ -58,8 +59,9 @@ GROUPS = {
     "sphere z": "sphere centres",
     "distance distance": "distances",
 }
+PARTS = {"robot": (of.SCATTER, of.ARM, of.WANDERING, of.STOP, of.UNSEEN), "error over incidence": (of.INCIDENCE,)}
 PLATE = SpherePlate(radius=28.0)
-VIEWS, PIXELS, INCIDENCE = 8, 130, 0.2
+VIEWS, PIXELS, OVER_INCIDENCE = 8, 130, 0.2
 ARM = 0.3  # of an ordinary arm, in plausible sizes
 FIELD = 0.01  # of a scanner with smooth errors, mm rms
 SCAN_LENGTHS = (0.05, 0.3)  # over which those of a single scan stay alike, as shares of the field
@@ -88,12 +90,16 @@ def feature_trial(job: Row) -> Row:
 
 def _measured(job: Row) -> tuple[PlaceErrors, FeatureList, Array]:
     """Errors of places in a run of the cell, what is measured there, and its true numbers."""
+    state, measured = _run_of(job)
+    return place_errors(state), *features_of(measured)
+
+
+def _run_of(job: Row) -> tuple[RunData, Measured]:
     kind = job["kind"]
     # The same part in all cells, and a quarter of the simulation.
     with patch("data_synth.simulate.part_mesh", lambda scene: _plate()):
         measured = cell(kind, job["seed"])
-    state = run(session_of(measured), effects=("joint_compliance",) if kind == "effect in the model" else ())
-    return place_errors(state), *features_of(measured)
+    return run(session_of(measured), effects=("joint_compliance",) if kind == "effect in the model" else ()), measured
 
 
 @cache
@@ -108,7 +114,7 @@ def cell(kind: str, seed: int, day: int = 0) -> Measured:
     hidden = {"joint_compliance": 1.0} if kind == "effect in the model" else {}
     if kind == "smooth scanner errors":
         scanner = replace(scanner, field_error=FIELD)
-        hidden = {"incidence_bias": INCIDENCE}
+        hidden = {"incidence_bias": OVER_INCIDENCE}
     if kind in (NEW_IN_EACH, ARM_AND_NEW):
         length = np.exp(np.random.default_rng([seed, 78]).uniform(*np.log(SCAN_LENGTHS)))
         scanner = replace(scanner, scan_error=FIELD, scan_error_length=float(length))
@@ -185,6 +191,59 @@ def covered_interval(seeds: Array, covered: Array) -> Array:
 
 
 FEATURES = Table(feature_jobs, feature_trial, feature_summary, range(47_000, 47_200), page="measure", block="coverage")
+
+
+def source_trial(job: Row) -> Row:
+    """Numbers of a cell: the group of the feature, and by part of the budget its variance and its true error.
+
+    True poses and the true error over incidence reach the numbers as their sources do; the rest is all else.
+    """
+    state, measured = _run_of(job)
+    places, (features, truth) = place_errors(state), features_of(measured)
+    result = measure_features(places, features)
+    by_model = measured.T_base_flange @ measured.T_mount
+    about = frames.make(np.eye(3), -places.centre)
+    apart = about @ measured.T_reference_scanner @ frames.inverse(about @ by_model)
+    of_robot = error_chain(state).of_poses(frames.log(apart).reshape(-1, 1))[0]
+    usual = next(source for source in places.sources if source.name == of.INCIDENCE)
+    size = OVER_INCIDENCE if job["kind"] == "smooth scanner errors" else nature.SMALL["incidence_bias"]
+    times = nature.LAWS["incidence_bias"].draw(size, None, np.random.default_rng(0))["b"] / usual.shapes[-1, 0]
+    known = (
+        ErrorSource("robot", of_robot, 0 * usual.shapes, 1.0),
+        replace(usual, views=times * usual.views, shapes=times * usual.shapes),
+    )
+    exact = replace(places, sources=known, scan_errors=None)
+    slopes = number_table(features.features, result.fits)[-1]
+    true = slopes @ np.vstack([exact.loadings(fit.at, fit.gradient)[0] for fit in result.fits])
+    rows = []
+    for number, (robot, incidence), value in zip(result.numbers, true.tolist(), truth, strict=True):
+        shares = [sum(number.shares.get(name, 0.0) for name in names) for names in PARTS.values()]
+        variances = [number.u**2 * share for share in (*shares, 1 - sum(shares), 1.0)]
+        error = number.value - float(value)
+        errors = (robot, incidence, error - robot - incidence, error)
+        rows.append((GROUPS[f"{number.feature.kind} {number.quantity}"], variances, errors))
+    return {"numbers": rows}
+
+
+def source_summary(rows: list[Row]) -> list[str]:
+    """A line a feature: of each part its share of the variance, and U over twice its true spread with a 95 % interval
+    over cells, which are drawn again."""
+    rng = np.random.default_rng(0)
+    lines = []
+    for group in dict.fromkeys(GROUPS.values()):
+        of_cells = [[(v, e) for g, v, e in row["numbers"] if g == group] for row in rows]
+        variances, errors = np.moveaxis(np.array(of_cells), 2, 0)
+        squares = np.mean(errors**2 / variances, axis=1)
+        drawn = squares[rng.integers(len(rows), size=(4000, len(rows)))].mean(axis=1)
+        low, high = np.quantile(drawn**-0.5, [0.025, 0.975], axis=0)
+        share = 100 * np.mean(variances / variances[..., -1:], axis=(0, 1))
+        mean = squares.mean(axis=0) ** -0.5
+        cells = zip(mean, low, high, share, strict=True)
+        lines.append([group, *(f"{m:.2f} ({a:.2f} to {b:.2f}), {s:.0f} %" for m, a, b, s in cells)])
+    return markdown(" | ".join(["feature", *PARTS, "noise and smooth errors", "all"]), lines)
+
+
+SOURCES = Table(feature_jobs, source_trial, source_summary, range(46_200, 46_240), page="measure", block="sources")
 
 
 def trials_jobs(seeds: range, trials: int) -> Iterator[Row]:

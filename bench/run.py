@@ -32,6 +32,7 @@ TABLES = {
     "driven": "drive:TABLE",
     "faults": "faults:TABLE",
     "features": "metrology:FEATURES",
+    "features-by-source": "metrology:SOURCES",
     "features-monte-carlo": "metrology:MONTE_CARLO",
     "few-views": "hand_eye_sigmas:FEW_VIEWS",
     "few-sessions": "few_sessions:TABLE",

@@ -30,7 +30,13 @@ from stitch.numerics.variance_posterior import mean_variances, satterthwaite
 from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, STOP_COMPONENTS, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import apparent_twists, view_columns
 from stitch.observations.surfaces.hand_eye_fit import FittedEffects, HandEyeSolution, hand_eye_jacobian, solve_hand_eye
-from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
+from stitch.observations.surfaces.scanner_errors import (
+    COARSE,
+    SHARED,
+    half_field,
+    sum_smooth_errors,
+    view_error_likelihood,
+)
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
 from stitch.plugins.metrology.scan_errors import ScanErrors, fit_scan_errors, scan_error_twists
@@ -216,9 +222,13 @@ def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, list[tuple[s
     units = np.split(np.eye(twists.shape[1]), [-1], axis=1)
     if not np.isfinite(noise):
         return twists, [(SCANNER, 0 * units[0], _MANY)], None
-    likelihood = shared_error_likelihood(sums, twists, chain.unconstrained, noise)
-    spread = likelihood.share_spread(likelihood.map_shares)
-    shares = likelihood.map_shares * np.exp(spread**2)
+    # Beside errors of single views, which else pass for shared ones; finer shared ones are not among the shapes here.
+    of_views, _ = sum_smooth_errors(run.measurement, chain.unconstrained, per_view=True)
+    likelihood = view_error_likelihood(of_views, chain.unconstrained, noise)
+    likelihood = replace(likelihood, design=(likelihood.design[SHARED][:, :COARSE], *likelihood.design[1:]))
+    likeliest = likelihood.map_shares
+    spread = likelihood.share_spread(likeliest)
+    shares = likeliest * np.exp(spread**2)
     estimates = []
     shared = []
     for cause, name in enumerate((SCANNER, INCIDENCE)):
