@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
+from stitch.diagnosis.sentences import curve_sentences, fitted_amounts, posterior_text
 from stitch.numerics.units import MICROMETRES
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.plain_words import effect_description, effect_in_words
@@ -62,6 +63,8 @@ def log_diagnosis(
     length_unit = session.length_unit
     um = MICROMETRES[length_unit]
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
+    posteriors = {c.name: c.ranked.posterior for c in shown}
+    posterior = partial(posterior_text, found.verdict, found.effects, posteriors)
     told = [] if screen is None else screen["candidates"]
     on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in told if c["mean"] is not None}
     plain = plain_finding(found, length_unit) if screen is None else screen["headline"]
@@ -74,7 +77,7 @@ def log_diagnosis(
         "|---:|---|---:|---:|---:|---|",
     ]
     lines += [
-        f"| {i} | {c.name} | {c.ranked.adjusted:.1g} | {c.ranked.posterior:.2f} | {on_part.get(c.name, '–')} "
+        f"| {i} | {c.name} | {c.ranked.adjusted:.1g} | {posterior(c.name)} | {on_part.get(c.name, '–')} "
         f"| {fitted_amounts(c.ranked).replace('-', '−')} |"
         for i, c in enumerate(shown)
     ]

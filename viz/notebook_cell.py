@@ -16,7 +16,7 @@ from viz.history_figures import error_falling
 from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import camera_for, part_surface
 from viz.run_numbers import residual_vectors
-from viz.run_page import report_html
+from viz.run_page import page_with_diagnosis, report_html
 
 # Steps of the model side by side, the last ones.
 _STEPS = 4
@@ -26,9 +26,10 @@ _HEIGHT = 980
 def notebook_view(run: RunData) -> str:
     """Return HTML for a cell: the screen of report.html in a frame, so that neither styles nor names of a notebook's
     other cells come into it. It asks no server."""
-    name = html.escape(run.session.name)
+    name, folder = html.escape(run.session.name), getattr(run, "folder", None)
+    page = report_html(run) if folder is None else page_with_diagnosis(run, folder / "report.html")
     return (
-        f'<iframe srcdoc="{html.escape(report_html(run))}" sandbox="allow-scripts" title="{name}" '
+        f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{name}" '
         f'style="width: 100%; height: {_HEIGHT}px; border: 0"></iframe>'
     )
 

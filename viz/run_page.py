@@ -163,11 +163,20 @@ def write_report(run: RunData, path: Path, tolerance: float | None = None) -> No
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    diagnosed = _is_diagnosed(run, path.parent)
-    sections = sections_of(path.read_text(encoding="utf-8")) if diagnosed and path.is_file() else {}
-    page = with_sections(report_html(run, tolerance, diagnosed), sections)
+    page = page_with_diagnosis(run, path, tolerance)
     with whole_file(path) as file:
         file.write_text(page, encoding="utf-8")
+
+
+def page_with_diagnosis(run: RunData, path: Path, tolerance: float | None = None) -> str:
+    """Return the page of a run, with what a diagnosis of this very model said on the page at `path`.
+
+    Args:
+        tolerance: as of `write_report`.
+    """
+    diagnosed = _is_diagnosed(run, path.parent)
+    sections = sections_of(path.read_text(encoding="utf-8")) if diagnosed and path.is_file() else {}
+    return with_sections(report_html(run, tolerance, diagnosed), sections)
 
 
 def report_html(run: RunData, tolerance: float | None = None, diagnosed: bool = False) -> str:

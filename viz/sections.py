@@ -9,12 +9,18 @@ from markupsafe import escape
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
-from stitch.diagnosis.sentences import fitted_amounts
+from stitch.diagnosis.sentences import fitted_amounts, posterior_text
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
 from stitch.output.finding_screen import finding_screen
-from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
+from stitch.output.plain_finding import (
+    command_without_a_view,
+    largest_error_sources,
+    plain_finding,
+    remedy_at_machine,
+    suggested_command,
+)
 from stitch.output.plain_words import effect_description
 from stitch.run_data import RunData
 from stitch.system.files import whole_file
@@ -129,18 +135,23 @@ def _in_um(value: float, unit: str) -> str:
 
 def _next(found: Diagnosis, run: str) -> str:
     why, command = suggested_command(found, shlex.quote(run)).rsplit(": ", 1)
-    said = "Type, where the folder of this page stands" if why == "Next" else why.removeprefix("Next, ").capitalize()
+    said = "Type, where the folder of this page stands" if why == "Next" else _purpose(why)
+    poses = [proposal for proposal in found.next if proposal.probability is not None]
+    scan = instead = ""
+    if poses and command.endswith("next.src"):
+        odds = f"with a probability of {poses[0].probability:.0%}: {poses[0].do}. {NOT_IN_ODDS}"
+        said = f"The view that decides {deciding_words(found)}, {odds} Its robot program"
+        scan = "<p>Scan there, add scan and row to the session, and run it again.</p>"
+        why_now, now = command_without_a_view(found, shlex.quote(run)).rsplit(": ", 1)
+        instead = "" if now.startswith("stitch next") else f"<p>No time? {_words(_purpose(why_now))}:</p>{_typed(now)}"
     does = "It adds what is missing and fits the same views anew." if command.startswith("stitch add") else ""
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
-    typed = f"<p>{_words(said)}:</p>{_typed(command)}"
-    poses = [proposal for proposal in found.next if proposal.probability is not None]
-    if found.verdict in ("cannot_tell", "unknown_effect") and poses:
-        odds = f"with a probability of {poses[0].probability:.0%}: {poses[0].do}. {NOT_IN_ODDS}"
-        decides = _words(f"The view that decides {deciding_words(found)}, {odds}")
-        instead = "" if command.startswith("stitch next") else f"<p>{_words('No time? ' + said)}:</p>{_typed(command)}"
-        scan = "<p>Scan there, add scan and row to the session, and run it again.</p>"
-        typed = f"<p>{decides}</p>{_typed(f'stitch next {shlex.quote(run)} -o next.src')}{scan}{instead}"
-    return f'<div class="card next"><h2>Next</h2>{typed}{after}</div>'
+    return f'<div class="card next"><h2>Next</h2><p>{_words(said)}:</p>{_typed(command)}{scan}{instead}{after}</div>'
+
+
+def _purpose(why: str) -> str:
+    """Return what a command is for, of the words before it."""
+    return why.removeprefix("Next, ").capitalize()
 
 
 def _typed(command: str) -> str:
@@ -184,11 +195,12 @@ def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
     shown = [s for s in found.candidates if s.ranked.score.observable][:_SHOWN]
     compared = finding_screen(found)["candidates"]
     on_part = {row["effect"]: f"{row['mean'] * um:.3g}" for row in compared if row["mean"] is not None}
+    posteriors = {s.name: s.ranked.posterior for s in shown}
     return [
         {
             "name": s.name,
             "p": f"{s.ranked.adjusted:.1g}".replace("-", "−"),
-            "posterior": f"{s.ranked.posterior:.2f}",
+            "posterior": posterior_text(found.verdict, found.effects, posteriors, s.name),
             "told": "; ".join(filter(None, [effect_description(s.name), fitted_amounts(s.ranked).replace("-", "−")])),
             "rms_if_added": _rms(found, s, 0, um),
             "heldout": _rms(found, s, 1, um),

@@ -238,6 +238,7 @@ class Run(RunData):
 
     # With the views that were left out; and calls of a recorder, replayed by `save`.
     measured: Session | None = field(default=None, compare=False)
+    folder: Path | None = field(default=None, compare=False)  # that it was read from
     recorded: tuple[tuple[str, tuple[Any, ...]], ...] = field(default=(), compare=False)
 
     @property

@@ -147,7 +147,7 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
     """
     folder = Path(folder)
     run = stored_run.load_run(folder, effects_file, trust=trust)
-    return public_run(replace(run, source=run.fit), None)
+    return replace(public_run(replace(run, source=run.fit), None), folder=folder)
 
 
 def diagnose(run: RunData) -> Diagnosis:

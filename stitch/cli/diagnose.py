@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,11 +106,14 @@ def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str
 
 def show_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the finding for everybody, the evidence, the likeliest effects, and where the error comes from."""
+    from stitch.diagnosis.sentences import posterior_text
     from stitch.numerics.units import length_text
     from stitch.output.plain_finding import open_doubts, plain_finding
     from stitch.run_data import doubt_remedy
 
     length_unit = diagnosis.linear.measurement.length_unit
+    posteriors = {c.name: c.ranked.posterior for c in diagnosis.candidates}
+    posterior = partial(posterior_text, diagnosis.verdict, diagnosis.effects, posteriors)
 
     def rms_if_added(candidate: CandidateEffect, heldout: bool) -> str:
         if not candidate.ranked.score.observable or candidate.cross_validation is None:
@@ -125,7 +129,7 @@ def show_diagnosis(diagnosis: Diagnosis) -> None:
     columns = (
         ("effect", lambda c: c.name),
         ("p", lambda c: f"{c.ranked.adjusted:.1g}" if c.ranked.score.observable else "not seen"),
-        ("posterior", lambda c: f"{c.ranked.posterior:.2f}" if c.ranked.score.observable else "–"),
+        ("posterior", lambda c: posterior(c.name) if c.ranked.score.observable else "–"),
         ("rms if added", lambda c: rms_if_added(c, heldout=False)),
         ("on views left out", lambda c: rms_if_added(c, heldout=True)),
     )

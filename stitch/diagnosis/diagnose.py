@@ -88,6 +88,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         depends_on=dependences(linear, evidence.named, evidence.dictionary),
         missing=missing,
         linear=linear,
+        run=state,
         notes=evidence.notes,
         coincidence=evidence.coincidence,
         scatter_limit=limit,

@@ -16,6 +16,7 @@ from stitch.diagnosis.verdict import Answer
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError
+from stitch.run_data import RunData
 from stitch.system.values import Table, Value
 
 
@@ -88,6 +89,7 @@ class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_docu
     depends_on: tuple[Dependence, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
     linear: LinearModel
+    run: RunData = field(repr=False)  # that was diagnosed
     scatter_limit: ScatterLimit  # that no sound arm exceeds, or that is stated
     implausible: bool  # the poses scatter by more than that
     expected_scatter: ScatterLimit  # that is stated, or of an ordinary arm

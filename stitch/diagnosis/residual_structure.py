@@ -24,7 +24,7 @@ from stitch.numerics.reml import fit_variances
 from stitch.numerics.variance_posterior import mean_variances
 from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER
-from stitch.observations.surfaces.matching import signed_distances
+from stitch.observations.surfaces.matching import Match, signed_distances
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.surface_model import surfaces_of
 
@@ -131,7 +131,9 @@ def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingErro
     return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)
 
 
-def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
+def predicted_distances(
+    linear: LinearModel, scored: Score | None = None, matches: Sequence[Match] | None = None
+) -> Array | None:
     """Return (M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
 
     In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
@@ -139,7 +141,10 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
     no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
     independently than beside all that an arm may do, and that one `add` reaches.
 
-    In the order of the matches of the free network. None without clouds.
+    In the order of the matches. None without clouds.
+
+    Args:
+        matches: of the same views; None: of the free network.
     """
     surfaces = surfaces_of(linear)
     if surfaces is None:
@@ -163,7 +168,8 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
         else:
             twists = X @ solution
     overlaps = surfaces.unconstrained.overlaps
-    matches, centre, of_views = overlaps.matches, overlaps.gram.centre, twists.reshape(-1, 6)
+    matches = overlaps.matches if matches is None else matches
+    centre, of_views = overlaps.gram.centre, twists.reshape(-1, 6)
     # B(δ_v − δ_w) of the normal equations, not by moving the views: where hand-eye and links can stand in for one
     # another, both move far and their common motion alone counts.
     along = [frames.plane_rows(m.middle - centre, m.normal) @ (of_views[m.v] - of_views[m.w]) for m in matches]

@@ -308,6 +308,17 @@ def odds_text(log_odds: float) -> str:
     return f"{likelier} to 1" if log_odds >= 0 else f"1 to {likelier}"
 
 
+def posterior_text(verdict: str, named: Sequence[str], posteriors: dict[str, float], effect: str) -> str:
+    """Return the probability of an effect; of one that these views cannot tell from others that of all together.
+
+    How it is shared among those is a judgement of how often each is met, which did not decide.
+    """
+    if verdict != "cannot_tell" or effect not in named:
+        return f"{posteriors[effect]:.2f}"
+    together = sum(posteriors.get(name, 0.0) for name in named)
+    return "cannot tell" if len(named) == 1 else f"{together:.2f} together"
+
+
 def fitted_amounts(ranked: Ranked, at_most: int = 3) -> str:
     """Return the clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
     scored = ranked.score

@@ -4,6 +4,7 @@ The page of a run, its review and the first tab of its recording draw from this 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,15 @@ from stitch.diagnosis.effect_trend import (
 )
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
 from stitch.diagnosis.sentences import fitted_amounts, odds_text
-from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import project_out
 from stitch.numerics.units import angle_text, display_unit, length_text
-from stitch.observations.surfaces.surface_model import surfaces_of
-from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
-from stitch.output.plain_finding import open_doubts
+from stitch.output.comparison.disagreement_field import DisagreementField, Patches
+from stitch.output.comparison.model_history import model_history
+from stitch.output.plain_finding import law_in_words, open_doubts
 from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, effect_description, plain_covariate
 from stitch.system.threads import remembered
 
@@ -75,23 +76,21 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
 def _fields(
     diagnosis: Diagnosis, candidates: Sequence[CandidateEffect]
 ) -> tuple[Patches | None, DisagreementField | None, dict[str, DisagreementField]]:
-    """Return the field of disagreement on its patches as it is, and as each candidate would leave it.
+    """Return the field of disagreement on its patches as the run shows it, and as each candidate would leave it.
 
     None without clouds.
     """
-    linear = diagnosis.linear
-    present = predicted_distances(linear)
-    surfaces = surfaces_of(linear)
-    if present is None or surfaces is None:
+    history, registered = model_history(diagnosis.run), diagnosis.run.registered
+    if history is None or registered is None:
         return None, None, {}
-    overlaps = surfaces.unconstrained.overlaps
-    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
-    if_added = {}
+    patches, present = history.patches, history.models[-1].field
+    before, if_added = predicted_distances(diagnosis.linear, matches=registered.matches), {}
     for candidate in candidates:
-        distances = predicted_distances(linear, candidate.ranked.score)
-        assert distances is not None
-        if_added[candidate.name] = patches.field(distances)
-    return patches, patches.field(present), if_added
+        after = predicted_distances(diagnosis.linear, candidate.ranked.score, registered.matches)
+        assert before is not None and after is not None
+        change = patches.field(after - before)
+        if_added[candidate.name] = replace(present, values=present.values + change.values)
+    return patches, present, if_added
 
 
 def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
@@ -154,8 +153,12 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
         if more > _WORSE * left:
             return f"{'yes, though' if is_named else 'no:'} it leaves {length_text(more, unit, 1)} more"
     if is_named:
-        return "yes"
+        rarer = candidate.ranked.log_belief < named.ranked.log_belief
+        return "yes; that it is met more rarely is a judgement" if rarer else "yes"
     against = named.ranked.score.log_bayes_factor - candidate.ranked.score.log_bayes_factor
+    objection = next((note for note in diagnosis.notes if note.startswith(f"{candidate.name}: ")), "")
+    if objection and against < ODDS:
+        return f"no: {objection.removeprefix(f'{candidate.name}: ')}"
     return f"no: the evidence is {odds_text(max(against, 0.0))} against it"
 
 
@@ -232,6 +235,8 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
             if diagnosis.follows_field:
                 by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
                 follows = ": each scan errs by itself" if by_view else ": the scanner errs over its field of view"
+            elif diagnosis.laws:
+                follows = f": {' or '.join(map(law_in_words, diagnosis.laws))}"
             elif diagnosis.curves:
                 follows = f": the error follows joint {diagnosis.curves[0].joint}"
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
@@ -344,10 +349,13 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) ->
 
 
 def _decided_by(diagnosis: Diagnosis) -> str:
-    """Return how likely the next view decides, as a sentence; empty where no pose does."""
-    first = next((proposal.probability for proposal in diagnosis.next if proposal.probability is not None), None)
+    """Return how likely the proposed views decide, as a sentence; empty where no pose does."""
+    odds = [proposal.probability for proposal in diagnosis.next if proposal.probability is not None]
+    if not odds:
+        return ""
     does = "may tell whether one does" if diagnosis.verdict == "unknown_effect" else "decides"
-    return "" if first is None else f" One more view {does} ({first:.0%})."
+    several = f", {len(odds)} with {odds[-1]:.0%}" if len(odds) > 1 else ""
+    return f" One more view {does} with a probability of {odds[0]:.0%}{several}."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
@@ -413,7 +421,8 @@ def certainty(diagnosis: Diagnosis) -> str:
             return f"{chance_text(named.adjusted)} {evidence}{nameless if named.posterior <= 0.5 else ''}"
         case "cannot_tell":
             # Of the weaker one: which of them is the true one nobody knows.
-            return chance_text(max(c.ranked.adjusted for c in diagnosis.candidates if c.name in diagnosis.effects))
+            chance = chance_text(max(c.ranked.adjusted for c in diagnosis.candidates if c.name in diagnosis.effects))
+            return f"{chance} {diagnosis.coincidence}." if diagnosis.coincidence else chance
         case "unknown_effect":
             clear = [x.p_value for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
             if clear:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.sentences import odds_text, unnamed_in_words
 from stitch.diagnosis.systematic_laws import law_of
@@ -110,7 +111,7 @@ def _error_location(diagnosis: Diagnosis) -> str:
     if diagnosis.follows_field:
         return ": the scanner's error depends on the position in its field of view"
     if diagnosis.laws:
-        return f": {' or '.join(law_of(r).words for r in diagnosis.laws)}"
+        return f": {' or '.join(map(law_in_words, diagnosis.laws))}"
     if diagnosis.curves:
         joints = " or ".join(dict.fromkeys(c.place for c in sorted(diagnosis.curves, key=lambda c: c.joint)))
         return f": the error follows {joints}, but no known formula"
@@ -124,6 +125,12 @@ def _error_location(diagnosis: Diagnosis) -> str:
         return f": the remaining error follows {' and '.join(follows[:2])}{where}"
     # The likeliest name, and why it does not hold.
     return f": {diagnosis.notes[0]}" if diagnosis.notes else ""
+
+
+def law_in_words(ranked: Ranked) -> str:
+    """Return a law of the dictionary as people call it: joint 5 follows the angle of joint 5 (a line)."""
+    law = law_of(ranked)
+    return law.words.replace(law.driver.name, plain_covariate(law.driver.name))
 
 
 def remedy_at_machine(diagnosis: Diagnosis) -> str:
@@ -154,6 +161,13 @@ def suggested_command(diagnosis: Diagnosis, run: str) -> str:
     """Return the command that most would type now, with what it is for; `run` as it has to be typed."""
     if open_doubts(diagnosis):
         return f"Next: fix the problem above; for details: stitch review {run}"
+    if any(proposal.probability is not None for proposal in diagnosis.next):
+        return f"Next, for the view that decides best: stitch next {run} -o next.src"
+    return command_without_a_view(diagnosis, run)
+
+
+def command_without_a_view(diagnosis: Diagnosis, run: str) -> str:
+    """Return the command for those who measure nothing further; as `suggested_command`."""
     match diagnosis.verdict:
         case "missing_effect" if not diagnosis.likelier_than_not:
             return f"Next, for views that would separate it from chance: stitch next {run}"

@@ -96,6 +96,16 @@ def test_a_cell_of_a_notebook_asks_no_server_and_holds_the_viewer(found):
     assert isinstance(found.plot(), Figure)
 
 
+def test_a_run_that_is_read_says_what_its_diagnosis_said_in_the_same_numbers(found, tmp_path, stitch_command):
+    folder = found.save(tmp_path / "run", recording=False)
+    stitch_command("diagnose", folder)
+    cell = html.unescape(stitch.load_run(folder)._repr_html_())
+    assert "How sure:" in cell and "Not diagnosed yet" not in cell
+    *_, model, _ = json.loads((folder / "result.json").read_text())["disagreement"]["steps"]
+    screen = json.loads((folder / "diagnosis.json").read_text())["screen"]
+    assert screen["now"]["mean"] == model["mean"]
+
+
 def test_where_nothing_draws_the_cell_is_the_report(found, monkeypatch):
     monkeypatch.setattr(api_run, "entry_points", lambda group: ())
     assert found._repr_html_() == f"<pre>{html.escape(str(found))}</pre>"

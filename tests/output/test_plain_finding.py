@@ -13,6 +13,7 @@ from stitch.api import stepwise
 from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
+from stitch.diagnosis.sentences import posterior_text
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
@@ -21,13 +22,14 @@ from stitch.output.diagnosis_document import DIAGNOSIS
 from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_in_words
 from stitch.screening.pose_tests import PoseStep
+from viz.review.run_snapshot import told_diagnosis
 
 
 def finding(verdict, *effects, **more):
     """A certain diagnosis in a session without doubts; `more` says what is otherwise."""
     candidates = [SimpleNamespace(name=name, cross_validation=None) for name in effects]
     usual = {"laws": (), "rival_trend": "", "doubts": (), "dropped_before": None, "certain": True, "curves": ()}
-    usual |= {"likelier_than_not": True, "time_curve": None, "candidates": candidates, "effects": effects}
+    usual |= {"likelier_than_not": True, "time_curve": None, "candidates": candidates, "effects": effects, "next": ()}
     return SimpleNamespace(verdict=verdict, **usual | more)
 
 
@@ -68,6 +70,26 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     if share > 0.95:
         model = SimpleNamespace(effects=[])
         assert stepwise.suggest_group(SimpleNamespace(model=model))[0] is None and command == "stitch next RUN"
+
+
+def test_where_a_view_decides_it_comes_before_a_group():
+    """On the terminal as on the page; the review's main button is this command."""
+    found = finding("cannot_tell", "play", "sag", next=(SimpleNamespace(probability=0.7),))
+    command = suggested_command(found, "RUN")
+    assert command.endswith(": stitch next RUN -o next.src")
+    document = {"verdict": "cannot_tell", "effects": ["play", "sag"], "plain": "", "sentence": ""}
+    assert told_diagnosis(document | {"next_command": command}, 1e3)["advised"] == "next"
+    assert told_diagnosis(document | {"next_command": "Next: stitch add RUN --group"}, 1e3)["advised"] == "group"
+
+
+def test_a_table_holds_no_number_that_did_not_decide():
+    """How often an effect is met shares out what the views cannot: beside "cannot tell" only the sum is known."""
+    shares = {"joint_offset": 0.94, "joint_step": 0.004, "sag": 0.01}
+    rivals = ("joint_offset", "joint_step")
+    told = [posterior_text("cannot_tell", rivals, shares, name) for name in shares]
+    assert told == ["0.94 together", "0.94 together", "0.01"]
+    assert posterior_text("missing_effect", ("joint_offset",), shares, "joint_offset") == "0.94"
+    assert posterior_text("cannot_tell", ("joint_offset",), shares, "joint_offset") == "cannot tell"
 
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])

@@ -4,9 +4,11 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from stitch.diagnosis.sentences import posterior_text
 from stitch.errors import InputError
 from stitch.numerics.units import MICROMETRES, format_amount
 from stitch.output.comparison.model_history import effect_changes
@@ -78,6 +80,8 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
     candidates = document.get("candidates", [])
     follows = [row for row in document.get("depends_on", []) if row["p_value"] is not None and row["p_value"] < 0.05]
     screen = document.get("screen") or {}
+    posteriors = {row["effect"]: row["posterior"] for row in candidates}
+    posterior = partial(posterior_text, document["verdict"], document["effects"], posteriors)
     return {
         "headline": screen.get("headline", ""),
         "proof": screen.get("proof", ""),
@@ -86,9 +90,12 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
         "courses": {row["effect"]: row["why"] for row in screen.get("candidates", [])},
         "verdict": document["verdict"],
         "named": document["effects"],
+        "advised": _advised(document.get("next_command", "")),
         "plain": plain or document["sentence"],
         "sentence": document["sentence"] if plain else "",
-        "candidates": [_candidate(row, um) for row in candidates if row["observable"]],
+        "candidates": [
+            _candidate(row, um) | {"posterior": posterior(row["effect"])} for row in candidates if row["observable"]
+        ],
         "unseen": [row["effect"] for row in candidates if not row["observable"] and not row.get("needs")],
         "untested": [{"effect": row["effect"], "needs": row["needs"]} for row in candidates if row.get("needs")],
         "follows": [
@@ -102,6 +109,12 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
             if row["variance_share"] and row["variance_share"] > 0.005
         ],
     }
+
+
+def _advised(command: str) -> str:
+    """Return which step the command of a diagnosis is: add, group, next, explain; empty where it is none of them."""
+    step = re.search(r"stitch (add|next|explain)\b", command)
+    return "" if step is None else "group" if "--group" in command else step[1]
 
 
 # What a diagnosis calls otherwise than a comparison does.
@@ -130,7 +143,6 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
         "effect": row["effect"],
         "is": effect_description(row["effect"]),
         "p": "–" if row["p_value"] is None else f"{row['p_value']:.1g}",
-        "posterior": row["posterior"],
         "rms_if_added": in_um(row["rms_if_added"]),
         "heldout_if_added": in_um(row["heldout_rms_if_added"]),
         "amounts": _amounts(row["parameters"]),

@@ -59,7 +59,7 @@ function candidate(c, found, state, most, ask, busy) {
     element("tr", { class: named ? "best" : "" }, element("td", {}, c.effect + (c.own ? " (your own)" : "")),
       element("td", { class: "bars", "aria-label": numbers(c.rms_if_added, c.heldout_if_added) },
         c.rms_if_added == null ? "–" : bars(c.rms_if_added, c.heldout_if_added, most, state.floor)),
-      element("td", {}, c.posterior.toFixed(2)), element("td", {}, look || "", " ", add)),
+      element("td", {}, c.posterior), element("td", {}, look || "", " ", add)),
     element("tr", {}, element("td", { class: "wide", colspan: "4" },
       [c.is, numbers(c.rms_if_added, c.heldout_if_added), signed(c.amounts), signed(`p = ${c.p}`), c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
   ];

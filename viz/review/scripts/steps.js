@@ -4,15 +4,22 @@ import { foresee } from "./scene.js";
 
 // `ask` sends a command; `busy` while one that changes the run is under way.
 export function showSteps(state, ask, busy) {
-  const found = state.diagnosis, naming = found && ["missing_effect", "cannot_tell"].includes(found.verdict), advisesGroup = naming && found.verdict === "cannot_tell";
-  const step = (text, command, main, before) => element("button", { type: "button", class: main ? "main" : "", disabled: busy, onclick: () => { if (before) before(); ask(command); } }, text);
-  const adds = naming ? found.named.map((effect, i) => step(`Add ${effect}`, { kind: "add", effects: [effect] }, i === 0 && !advisesGroup, () => foresee("add", effect))) : [];
+  const found = state.diagnosis, verdict = found && found.verdict;
+  // The main button is the command that the page's Next names.
+  const advised = found ? found.advised : "diagnose";
+  const step = (text, command, before) => {
+    const press = () => { if (before) before(); ask(command); };
+    const main = command.kind === advised && command.effects?.[0] === (advised === "add" ? found.named[0] : undefined);
+    return element("button", { type: "button", class: main ? "main" : "", disabled: busy, onclick: press }, text);
+  };
+  const add = effect => step(`Add ${effect}`, { kind: "add", effects: [effect] }, () => foresee("add", effect));
   at("steps").replaceChildren(...[
-    !found && step("Find what is missing", { kind: "diagnose" }, true),
-    ...adds,
-    advisesGroup && step("Add as a group", { kind: "group" }, true),
-    found && found.verdict === "unknown_effect" && step("Explain", { kind: "explain" }, true),
-    found && found.verdict !== "adequate" && step("Next pose", { kind: "next" }),
+    !found && step("Find what is missing", { kind: "diagnose" }),
+    verdict === "cannot_tell" && step("Next pose", { kind: "next" }),
+    ...(["missing_effect", "cannot_tell"].includes(verdict) ? found.named.map(add) : []),
+    verdict === "cannot_tell" && step("Add as a group", { kind: "group" }),
+    verdict === "unknown_effect" && step("Explain", { kind: "explain" }),
+    ["missing_effect", "unknown_effect"].includes(verdict) && step("Next pose", { kind: "next" }),
   ].filter(Boolean));
   at("to-note").onclick = () => at("note").focus();
 }
