@@ -231,6 +231,7 @@ def _content(
         "doubts": run.doubts,
         "tolerance": None if tolerance is None else tolerance * um,
         "tiles": run_tiles(run, history),
+        "on_cad": "" if run.session.cad is None else _on_cad(run),
         "part": shown_part(run, history, shape),
         "surfaces": history is not None,
         "views": view_rows(run, history),
@@ -245,6 +246,12 @@ def _content(
         "machine": machine_svg(run),
         "targets": target_rows(run),
     }
+
+
+def _on_cad(run: RunData) -> str:
+    from viz.cad_deviation import cad_sentence
+
+    return cad_sentence(run)
 
 
 def run_tiles(run: RunData, history: ModelHistory | None) -> list[Tile]:

@@ -17,18 +17,24 @@ import pyarrow.parquet as pq
 import pytest
 from markupsafe import escape
 
+import stitch
+from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
+from data_synth.shapes import build_shape
+from data_synth.write import write_session
 from stitch.api.pipeline import diagnose, run
 from stitch.cli.main import main
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
+from stitch.numerics import frames
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
 from stitch.output.result_document import result_document
 from tests.in_browser import require_for_everybody
+from viz.cad_deviation import cad_sentence
 from viz.diagnosis_plots import budget_rows, diagnosis_plots
 from viz.page_parts import render, unbroken
 from viz.review.chosen_field import Choice
@@ -81,6 +87,21 @@ def test_the_page_says_what_the_result_says(recorded, page):
     assert unbroken(plain_verdict(model_history(run), "mm")) in page
     assert escape(unbroken(run.verdict)) in page
     assert "<dt>Session</dt>" in page
+
+
+@pytest.mark.slow
+def test_the_page_says_whether_an_effect_brought_the_part_onto_its_cad(tmp_path):
+    """The CAD in metres and in a frame of its own; nothing is said before the model was changed, or without a CAD."""
+    measured = measured_blade(0, views=6, pixels=70, hidden={"link_geometry": 2.0})
+    write_session(tmp_path / "s", measured, "blade")
+    first = stitch.run(stitch.load_session(tmp_path / "s"))
+    mesh = build_shape("blade").apply_transform(frames.exp(np.array([0.2, 0.1, -0.3, 40.0, -20.0, 9.0])))
+    mesh.apply_scale(1e-3).export(tmp_path / "cad.ply")
+    of_cad = {"cad": tmp_path / "cad.ply", "cad_unit": "m"}
+    better = stitch.add(first, "link_geometry")
+    told = cad_sentence(replace(better, session=replace(better.session, **of_cad)))
+    assert re.fullmatch(r"Deviation from the CAD: .+ before, .+ with it \(rms\). The part got better.", told)
+    assert cad_sentence(replace(first, session=replace(first.session, **of_cad))) == cad_sentence(better) == ""
 
 
 def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):

@@ -66,15 +66,15 @@ def read_cad(file: Path) -> CadSurface:
     return cad_surface(mesh)
 
 
-def cad_surface(mesh: Any) -> CadSurface:
-    """Make a trimesh ready for searching."""
+def cad_surface(mesh: Any, fineness: float = 800) -> CadSurface:
+    """Make a trimesh ready for searching, with so many samples along its diagonal."""
     import igl
 
     centre = mesh.bounds.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
     boxes = igl.AABB()
     boxes.init(*_arrays(mesh))
-    count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
+    count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / fineness) ** 2)))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
     normals = np.asarray(mesh.face_normals[faces])
     reach = size / 30

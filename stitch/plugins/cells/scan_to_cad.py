@@ -401,10 +401,10 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> tuple[Array, float, fl
     gate = cad.size / 25
     fine = cad.size / 250
     ranked = sorted(_axis_candidates(points, cad), key=lambda T: -_inlier_share(T, points, normals, cad, gate))
-    refined = [_refine(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
+    refined = [refine_start(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
     shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
     if max(shares) < _CERTAIN:
-        refined += [_refine(T, points, normals, cad, gate) for T in _feature_candidates(points, normals, cad)]
+        refined += [refine_start(T, points, normals, cad, gate) for T in _feature_candidates(points, normals, cad)]
         shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
     best = int(np.argmax(shares))
     corners = cad.samples[:: max(1, len(cad.samples) // 200)]
@@ -464,7 +464,7 @@ def _inlier_share(T_base_part: Array, points: Array, normals: Array, cad: CadSur
     return float(np.mean(same & (np.linalg.norm(local - cad.samples[index], axis=1) < gate)))
 
 
-def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> Array:
+def refine_start(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> Array:
     """Return the pose (4, 4) after point-to-plane steps with a gate that closes to a tenth."""
     for width in gate * np.geomspace(4.0, 0.1, _REFINE):
         T = frames.inverse(T_base_part)
