@@ -154,7 +154,7 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
             return f"{'yes, though' if is_named else 'no:'} it leaves {length_text(more, unit, 1)} more"
     if is_named:
         rarer = candidate.ranked.log_belief < named.ranked.log_belief
-        return "yes; that it is met more rarely is a judgement" if rarer else "yes"
+        return "yes, though met more rarely (a judgement)" if rarer else "yes"
     against = named.ranked.score.log_bayes_factor - candidate.ranked.score.log_bayes_factor
     objection = next((note for note in diagnosis.notes if note.startswith(f"{candidate.name}: ")), "")
     if objection and against < ODDS:
@@ -241,10 +241,10 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
                 follows = f": the error follows joint {diagnosis.curves[0].joint}"
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
-            return f"Something is missing that no known effect explains{follows}.{_decided_by(diagnosis)}"
+            return f"Something is missing that no known effect explains{follows}."
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
     if len(named) > 1:
-        return _rivals(named, trends) + _decided_by(diagnosis)
+        return _rivals(named, trends)
     return f"{'' if diagnosis.certain else 'Perhaps: '}{_cause(named[0], trends.get(named[0].name))}."
 
 
@@ -283,7 +283,7 @@ def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     explained = 0.0
     if named is not None and named.cross_validation is not None:
         explained = max(total * (1 - named.cross_validation.heldout), 0.0)
-        sources.append(("effect", named.name, explained))
+        sources.append(("effect", named.name if len(diagnosis.effects) == 1 else "one of these", explained))
     scanner = min(diagnosis.noise_floor**2, total - explained)
     misfit = min(diagnosis.overlap_misfit**2, total - explained - scanner)
     left = max(total - explained - scanner - misfit, 0.0)
@@ -345,7 +345,7 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) ->
         return f"{joint.capitalize()} errs. These views cannot tell whether it {which}."
     causes = [_cause(c, trends.get(c.name)) for c in named]
     which = ", or ".join(cause[:1].lower() + cause[1:] for cause in causes)
-    return f"These views cannot tell which of {len(causes)} it is: {which}."
+    return f"{which[:1].upper()}{which[1:]}: these views cannot tell which."
 
 
 def _decided_by(diagnosis: Diagnosis) -> str:
@@ -353,9 +353,8 @@ def _decided_by(diagnosis: Diagnosis) -> str:
     odds = [proposal.probability for proposal in diagnosis.next if proposal.probability is not None]
     if not odds:
         return ""
-    does = "may tell whether one does" if diagnosis.verdict == "unknown_effect" else "decides"
     several = f", {len(odds)} with {odds[-1]:.0%}" if len(odds) > 1 else ""
-    return f" One more view {does} with a probability of {odds[0]:.0%}{several}."
+    return f" One more view decides with a probability of {odds[0]:.0%}{several}."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
@@ -422,7 +421,8 @@ def certainty(diagnosis: Diagnosis) -> str:
         case "cannot_tell":
             # Of the weaker one: which of them is the true one nobody knows.
             chance = chance_text(max(c.ranked.adjusted for c in diagnosis.candidates if c.name in diagnosis.effects))
-            return f"{chance} {diagnosis.coincidence}." if diagnosis.coincidence else chance
+            coincidence = f" {diagnosis.coincidence}." if diagnosis.coincidence else ""
+            return f"{chance}{coincidence}{_decided_by(diagnosis)}"
         case "unknown_effect":
             clear = [x.p_value for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
             if clear:

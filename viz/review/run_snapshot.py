@@ -91,6 +91,7 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
         "verdict": document["verdict"],
         "named": document["effects"],
         "advised": _advised(document.get("next_command", "")),
+        "instead": _advised(document.get("command_without_a_view", "")),
         "plain": plain or document["sentence"],
         "sentence": document["sentence"] if plain else "",
         "candidates": [

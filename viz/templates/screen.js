@@ -185,7 +185,7 @@ function duelPlot(rivals, view, names, um) {
   const [a, b] = view.expected, apart = Math.abs(a.value - b.value) > 2 * Math.hypot(a.sigma, b.sigma);
   return {
     title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that decides${apart ? "" : ", where they part in other directions than this one"}`,
-    spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ""}` }, series: [...lines, ...expected, dots] },
+    spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ` ${rivals[0].why.unit}`}` }, series: [...lines, ...expected, dots] },
   };
 }
 

@@ -17,7 +17,7 @@ export function showSteps(state, ask, busy) {
     !found && step("Find what is missing", { kind: "diagnose" }),
     verdict === "cannot_tell" && step("Next pose", { kind: "next" }),
     ...(["missing_effect", "cannot_tell"].includes(verdict) ? found.named.map(add) : []),
-    verdict === "cannot_tell" && step("Add as a group", { kind: "group" }),
+    found && [advised, found.instead].includes("group") && step("Add as a group", { kind: "group" }),
     verdict === "unknown_effect" && step("Explain", { kind: "explain" }),
     ["missing_effect", "unknown_effect"].includes(verdict) && step("Next pose", { kind: "next" }),
   ].filter(Boolean));
