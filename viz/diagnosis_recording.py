@@ -12,7 +12,7 @@ import rerun as rr
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts, posterior_text
 from stitch.numerics.units import MICROMETRES
-from stitch.output.plain_finding import plain_finding, suggested_command
+from stitch.output.plain_finding import plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
@@ -68,7 +68,7 @@ def log_diagnosis(
     told = [] if screen is None else screen["candidates"]
     on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in told if c["mean"] is not None}
     plain = plain_finding(found, length_unit) if screen is None else screen["headline"]
-    proof = [] if screen is None else [screen["proof"], f"How sure: {screen['certainty']}"]
+    proof = [] if screen is None else [screen["proof"], f"How sure: {screen['certainty']}", remedy_at_machine(found)]
     rec.log("diagnosis/plain", words("\n\n".join([f"**{plain}**", *proof])), static=True)
     courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]
     lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{suggested_command(found, 'RUN')}", ""]

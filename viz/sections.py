@@ -35,6 +35,11 @@ from viz.part_data import colour_stops
 _SHOWN = 8
 # What the scripts of the page draw from.
 _DRAWN = ("now", "why", "formula", "candidates", "places", "deciding_view")
+# What the command does that is proposed, where its purpose does not say it.
+_DOES = {
+    "add": "It adds what is missing and fits the same views anew.",
+    "export": "It writes the hand-eye for ROS.",
+}
 # Verdicts that name what is missing: the screen shows what adding it would change.
 _NAMING = ("missing_effect", "cannot_tell")
 
@@ -144,7 +149,7 @@ def _next(found: Diagnosis, run: str) -> str:
         scan = "<p>Scan there, add scan and row to the session, and run it again.</p>"
         why_now, now = command_without_a_view(found, shlex.quote(run)).rsplit(": ", 1)
         instead = "" if now.startswith("stitch next") else f"<p>No time? {_words(_purpose(why_now))}:</p>{_typed(now)}"
-    does = "It adds what is missing and fits the same views anew." if command.startswith("stitch add") else ""
+    does = _DOES.get(command.split()[1], "")
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
     return f'<div class="card next"><h2>Next</h2><p>{_words(said)}:</p>{_typed(command)}{scan}{instead}{after}</div>'
 

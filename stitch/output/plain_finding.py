@@ -136,7 +136,7 @@ def law_in_words(ranked: Ranked) -> str:
 def remedy_at_machine(diagnosis: Diagnosis) -> str:
     """Return what would end the effect that is named, or where to look for one without a name, as a sentence.
 
-    Empty where nothing is named, or only perhaps.
+    Empty where something is missing without a place to look, or only perhaps.
     """
     remedy = ""
     if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
@@ -154,6 +154,11 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
         remedy = f"look for what changes with {follows[0]}" if follows else ""
     elif diagnosis.verdict == "missing_effect" and diagnosis.certain:
         remedy = REMEDIES.get(diagnosis.effects[0], "")
+    elif diagnosis.verdict == "cannot_tell" and diagnosis.certain and not unnamed_in_words(diagnosis):
+        remedies = {REMEDIES.get(effect, "") for effect in diagnosis.effects}
+        remedy = remedies.pop() if len(remedies) == 1 else "change nothing until it is known which"
+    elif diagnosis.verdict == "adequate":
+        remedy = "nothing to mend was found"
     return f"At the machine: {remedy}." if remedy else ""
 
 
