@@ -136,17 +136,16 @@ def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
 
 
 def candidate_rows(
-    measurement: Measurement, seen: TargetRows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
-) -> tuple[TargetRows, list[Array], Array]:
-    """Return rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
+    measurement: Measurement, seen: TargetRows, landmarks: Landmarks, terms: Sequence[Term]
+) -> tuple[TargetRows, list[Array]]:
+    """Return rows of K views in which every target would be seen, and how they answer to `terms`.
 
     Args:
         measurement: of the candidate views.
         seen: rows of the views that were taken.
-        variances: (3,) of rotation scatter, translation scatter, factor on the sensor's noise.
 
     Returns:
-        Rows, one (K, m, P) per term, and (K, m, m).
+        Rows, and one (K, m, P) per term.
     """
     known = np.flatnonzero(np.isfinite(landmarks.positions).all(axis=1))
     measurement = _all_seen(measurement, seen, landmarks, known)
@@ -154,8 +153,7 @@ def candidate_rows(
     rows = target_rows(measurement.capture, seen.T_mount, undrawn)
     unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
     rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
-    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)
-    return rows, rows.effect_columns(measurement, Model(seen.T_mount), terms), covariance
+    return rows, rows.effect_columns(measurement, Model(seen.T_mount), terms)
 
 
 def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:

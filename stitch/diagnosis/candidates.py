@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -15,11 +14,10 @@ from stitch.effects.contract import (
     missing_need,
     of_each_scanner,
     one_by_one,
-    parameters_in,
     without_offset,
 )
 from stitch.effects.empirical import empirical_effects
-from stitch.model.model import Term
+from stitch.model.model import Term, grid_terms
 from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel, PointSums, Response
@@ -99,7 +97,7 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
     effects = [e for e in library if e.name not in missing]
     shapes = of_each_scanner(views, empirical_effects(views)) if empirical else []
     effects += [e for e in shapes if not missing_need(linear.measurement, e)]
-    terms_of = [_grid_terms(linear, effect) for effect in effects]
+    terms_of = [grid_terms(linear.measurement, effect) for effect in effects]
     responses = iter(linear.responses([term for terms in terms_of for term in terms]))
     tried = [_build_candidate(linear, terms, [next(responses) for _ in terms]) for terms in terms_of]
     return [c for c in tried if c is not None], missing
@@ -107,7 +105,7 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
 
 def candidate_of(linear: LinearModel, effect: Effect) -> Candidate | None:
     """Return one effect as a candidate; None if it has no parameters here."""
-    terms = _grid_terms(linear, effect)
+    terms = grid_terms(linear.measurement, effect)
     return _build_candidate(linear, terms, linear.responses(terms))
 
 
@@ -138,12 +136,6 @@ def free_masks(term: Term) -> list[Mask]:
     free = ~term.gridded
     alone = [free & np.isin(np.arange(len(free)), group) for group in groups]
     return [keep for keep in (free, *(keep for keep in alone if (keep != free).any())) if keep.any()]
-
-
-def _grid_terms(linear: LinearModel, effect: Effect) -> list[Term]:
-    """Return the effect at zero, once for every combination of its gridded parameters."""
-    zero = Term(effect, parameters_in(linear.measurement, effect))
-    return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
 
 def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:

@@ -46,6 +46,8 @@ from stitch.observations.pose_errors import (
     prior_pose_errors,
     usual_time_step,
 )
+from stitch.observations.row_model import ReducedRows
+from stitch.observations.row_reduction import pose_numbers
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
 from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.observations.targets.rows import TargetRows
@@ -343,9 +345,9 @@ def predict_views(
         case SurfaceObservation() as surfaces:
             further = _FurtherScans.of(linear, surfaces, joints, wait)
             return [_predict_scans(linear, scored, further) for scored in scores]
-        case TargetRows() as targets:
+        case ReducedRows(rows=TargetRows()) as observation:
             named = [scored for scored in scores if isinstance(scored, Score)]
-            return [_predict_targets(linear, targets, scored, joints, wait) for scored in named]
+            return _predict_targets(linear, observation, named, joints, wait)
     return []
 
 
@@ -491,20 +493,35 @@ def _given_views(
     return mean, (columns - seen.T @ white) @ root, seen.T @ seen
 
 
-def _predict_targets(linear: LinearModel, targets: TargetRows, scored: Score, joints: Array, wait: Array) -> Prediction:
-    """Return what a rival expects where all targets are seen: beside it views err independently."""
-    base = model_beside(linear, scored)
+def _predict_targets(
+    linear: LinearModel, observation: ReducedRows, scores: Sequence[Score], joints: Array, wait: Array
+) -> list[Prediction]:
+    """Return what rivals expect where all targets are seen, in numbers that a motion of the view or a rival moves.
+
+    Beside a rival views err independently.
+    """
+    targets = observation.rows
+    assert isinstance(targets, TargetRows)
     measurement = candidate_measurement(linear.measurement, joints, wait)
-    flange_and_noise = np.append(base.flange_scatter(base.null), base.null.variances[NOISE])
-    rows, columns, covariance = candidate_rows(
-        measurement, targets, targets.places, flange_and_noise, [zero_term(scored)]
-    )
-    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
-    every = np.concatenate([rows.hand_eye, rows.landmarks, extra, columns[0][..., scored.form.keep]], axis=2)
-    N, m, q = every.shape
-    mean, unknown, _ = _given_views(base, scored, every.reshape(-1, q), np.zeros((N * m, len(base.white_z))))
-    design = every[..., : base.white_design.shape[1]]
-    return Prediction(mean.reshape(N, m), unknown.reshape(N, m, -1), None, covariance, design)
+    rows, columns = candidate_rows(measurement, targets, targets.places, [zero_term(scored) for scored in scores])
+    within = [moved for scored, moved in zip(scores, columns, strict=True) if moves_points([scored.form.term])]
+    per_sigma = np.where(rows.noise > 0, rows.noise, np.inf) ** -0.5
+    turn = pose_numbers(per_sigma[..., None] * np.concatenate([rows.lever, *within], axis=2)) * per_sigma[:, None]
+    placed = rows.landmarks @ observation.reduction.kept
+    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - placed.shape[2]))
+    scattered = [turn @ moved for moved in rows.scattered]
+    predictions = []
+    for scored, moved in zip(scores, columns, strict=True):
+        base = model_beside(linear, scored)
+        every = turn @ np.concatenate([rows.hand_eye, placed, extra, moved[..., scored.form.keep]], axis=2)
+        N, d, q = every.shape
+        mean, unknown, _ = _given_views(base, scored, every.reshape(-1, q), np.zeros((N * d, len(base.white_z))))
+        own = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
+        for variance, of_flange in zip(base.flange_scatter(base.null), scattered, strict=True):
+            own += variance * (of_flange @ of_flange.transpose(0, 2, 1))
+        design = every[..., : base.white_design.shape[1]]
+        predictions.append(Prediction(mean.reshape(N, d), unknown.reshape(N, d, -1), None, own, design))
+    return predictions
 
 
 def model_beside(linear: LinearModel, scored: Score) -> LinearModel:

@@ -17,7 +17,7 @@ from stitch.diagnosis.thresholds import DEPENDENCE_BINS, FAINT_SIGMAS
 from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space, fit_columns
-from stitch.numerics.reml import at_variances
+from stitch.numerics.reml import NOISE, at_variances
 from stitch.observations.linear_model import LinearModel
 
 # Family-wise p of the clearest covariate at which the views are said to follow it (custom).
@@ -183,12 +183,14 @@ def _dependence(
     split = law.driver.name == STEP and int(np.argmax(law.shapes[:, 0] > 0))
     middle, mean, sigma = bin_means(x, along, split=float(split) - 0.5 if split else None)
     explained = np.sum((column_space(white).T @ linear.white_residual) ** 2)
+    # What no motion of a view makes is left as well.
+    whole = float(np.sum(linear.white_residual**2)) + linear.mixed.noise_only[1] / linear.null.variances[NOISE]
     return Dependence(
         covariate=law.driver.name,
         unit=law.driver.unit,
         place=law.place.name,
         shape=law.shape,
-        score=float(explained / max(float(np.sum(linear.white_residual**2)), 1e-300)),
+        score=float(explained / max(whole, 1e-300)),
         p_value=min(p_value, 1.0),
         p_beside=min(p_beside, 1.0),
         direction=direction,

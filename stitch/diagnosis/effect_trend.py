@@ -395,7 +395,8 @@ def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axi
     if not motion.columns.any():
         return None
     plot = _Plot(linear, motion, axis, np.zeros(0), np.zeros(0))
-    left = linear.mixed.z.ravel() - linear.reduce((linear.design @ linear.baseline_trial.solve())[:, None])[:, 0]
+    explained = linear.design @ linear.baseline_trial.solve()[-linear.design.shape[1] :]
+    left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
     # Each number of a block moves views of its own block alone, but for the mean of all.
     half = np.linalg.cholesky(_independent(scatter)).reshape(len(left), -1).astype(float)
     sigma = np.sqrt(np.sum(plot.along(half) ** 2, axis=1))

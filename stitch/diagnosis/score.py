@@ -342,11 +342,12 @@ def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
     # tr(MC) and tr(MCMC) with M = 1 − UUᵀ.
     along = covariance @ mean
     within = np.einsum("bik,bil->kl", mean, along)
-    total = float(np.trace(covariance, axis1=1, axis2=2).sum() - np.trace(within))
-    squares = float((covariance**2).sum() - 2 * (along**2).sum() + (within**2).sum())
+    count, square = mixed.noise_only
+    total = float(np.trace(covariance, axis1=1, axis2=2).sum() - np.trace(within)) + count * USUAL_NOISE_FACTOR
+    squares = float((covariance**2).sum() - 2 * (along**2).sum() + (within**2).sum()) + count * USUAL_NOISE_FACTOR**2
     known = max(total**2 / max(squares, 1e-300), 1e-9)
     chance = limits.ALPHA_UNKNOWN / 2 if expected.stated else limits.ALPHA
-    return float(left @ left) > total * chi2_limit(chance, known) / known
+    return float(left @ left) + square > total * chi2_limit(chance, known) / known
 
 
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:

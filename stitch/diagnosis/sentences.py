@@ -115,10 +115,22 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
     is_missing = "is missing" if d.certain else "may be missing"
     yield f"Something {is_missing}: {' or '.join([*d.effects, *unnamed_in_words(d)])}. These views cannot tell which."
+    yield _step_like_what_lasts(d)
     if d.coincidence:
         yield f"{d.coincidence}. To tell, drive a few of these poses again from the first side."
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
+
+
+def _step_like_what_lasts(d: Diagnosis) -> str:
+    """Say from which view on an effect of a group that begins there does what another does in all views."""
+    group = [c for c in d.candidates if c.name in d.effects]
+    for begins in group:
+        view = next((p.view for p in begins.ranked.score.form.term.parameters if p.discrete), None)
+        lasting = [c for c in group if begins.name in c.aliases and not c.ranked.score.form.term.gridded.any()]
+        if view is not None and lasting:
+            return f"{begins.name} from view {view} on looks the same in these views as {lasting[0].name} in all."
+    return ""
 
 
 def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:

@@ -238,7 +238,7 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     sizes = np.append(linear.sizes, scored.sizes)
     mean = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
     free = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, mean)
-    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0] - mean, 0.0)
+    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0][-len(mean) :] - mean, 0.0)
     freedom = limits.END_PRIOR_FREEDOM
     precision = (freedom + 1) / (freedom * sizes**2 + estimate**2)
     priors = CoefficientPrior(precision, mean), CoefficientPrior(precision[:a], mean[:a])

@@ -9,6 +9,7 @@ errors of one go with errors of another.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -217,6 +218,12 @@ def term_of(measurement: Measurement, effect: Effect) -> Term:
     """Return the effect at zero; parameters that are tried value by value in the middle of their grid."""
     parameters = parameters_in(measurement, effect)
     return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in parameters))
+
+
+def grid_terms(measurement: Measurement, effect: Effect) -> list[Term]:
+    """Return the effect at zero, once for every combination of its gridded parameters."""
+    zero = Term(effect, parameters_in(measurement, effect))
+    return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
 
 def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:

@@ -149,12 +149,7 @@ class BlockLeastSquares:
             k = len(precision)
             prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
             unit = equilibrated(self._sums[:k, :k] + prior)[1]
-            scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
-            root, failed = dpotrf(scaled, lower=1, clean=0)
-            if not failed and np.diag(root).min() > _SOLVABLE:
-                solutions.append(dpotrs(root, vector * unit, lower=1)[0] * unit)
-            else:
-                solutions.append(_pseudo_inverse(scaled, unit) @ vector)
+            solutions.append(solve_in_units(sums[:k, :k] + prior, vector, unit))
         return solutions
 
     def estimates_covariance(self) -> Array:
@@ -177,6 +172,15 @@ class BlockLeastSquares:
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
+
+
+def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:
+    """Return x (k,) of matrix·x = vector, symmetric (k, k), in units (k,) of x; in what nothing shows it is zero."""
+    scaled = matrix * np.outer(unit, unit)
+    root, failed = dpotrf(scaled, lower=1, clean=0)
+    if not failed and np.diag(root).min() > _SOLVABLE:
+        return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
+    return _pseudo_inverse(scaled, unit) @ vector
 
 
 def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Array:

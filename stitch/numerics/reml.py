@@ -164,6 +164,8 @@ class MixedModel:
     further: FurtherPrior | None = None  # of the c − 3 further components; None: there are none
     common: CommonCovariance | None = None  # of the same covariances, where many blocks have one but for a turn
     known_sums: MeanSums | None = None  # of A and z, where the model that this one extends has made them
+    # How many further numbers, beside z, are nothing but the sensor's noise, and their sum of squares.
+    noise_only: tuple[int, float] = (0, 0.0)
 
     @property
     def size(self) -> int:
@@ -311,7 +313,10 @@ class Likelihood:
                 taken = (flatten_blocks(W @ columns.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
                 against = W - taken @ taken.transpose(0, 2, 1)
                 slopes += mixed.components[:, at].reshape(len(slopes), -1) @ against.ravel()
-        return np.exp(self.log_variances) * slopes + self.prior_slope
+        slopes = np.exp(self.log_variances) * slopes + self.prior_slope
+        count, square = mixed.noise_only
+        slopes[NOISE] += count - square / np.exp(self.log_variances[NOISE])
+        return slopes
 
     @property
     def curvature(self) -> Array:
@@ -324,10 +329,13 @@ class Likelihood:
         if is_one_large(self.problem.mixed) and not isinstance(self.errors, PairWeights):
             return np.outer(variances, variances) * self._average_information
         if isinstance(self.errors, PairWeights):
-            return np.outer(variances, variances) * self.errors.curvature
-        shares = variances[:, None, None, None] * (self.errors.matrix @ self.problem.mixed.components)
-        count = len(variances)
-        return shares.reshape(count, -1) @ shares.transpose(0, 1, 3, 2).reshape(count, -1).T
+            curvature = np.outer(variances, variances) * self.errors.curvature
+        else:
+            shares = variances[:, None, None, None] * (self.errors.matrix @ self.problem.mixed.components)
+            count = len(variances)
+            curvature = shares.reshape(count, -1) @ shares.transpose(0, 1, 3, 2).reshape(count, -1).T
+        curvature[NOISE, NOISE] += self.problem.mixed.noise_only[0]
+        return curvature
 
     @property
     def _average_information(self) -> Array:
@@ -380,8 +388,10 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
         square = float(np.sum((errors.half @ rest) ** 2))
     square += float(mean @ (problem.precision * mean))
     prior, prior_slope = log_prior(log_variances, mixed.further)
-    value = errors.logdet + of_information + problem.offset + square + prior
-    return Likelihood(problem, log_variances, value, mean, half, errors, sums, errors.logdet + prior, prior_slope)
+    count, square_of_noise = mixed.noise_only
+    of_variances = errors.logdet + prior + count * log_variances[NOISE] + square_of_noise / variances[NOISE]
+    value = of_variances + of_information + problem.offset + square
+    return Likelihood(problem, log_variances, value, mean, half, errors, sums, of_variances, prior_slope)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:

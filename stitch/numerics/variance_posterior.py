@@ -90,6 +90,7 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
         - 2 * np.einsum("cbik,dbik->cd", KU, KU, optimize=True)
         + np.einsum("ckl,dkl->cd", within, within, optimize=True)
     )
+    information[NOISE, NOISE] += 0.5 * mixed.noise_only[0]
     information += np.diag(prior_information(null.variances, mixed.further))
     return Satterthwaite(white, np.linalg.pinv(information, rcond=1e-9, hermitian=True))
 

@@ -81,7 +81,7 @@ class LinearTrial(Protocol):
     """A model with some columns, in the linear approximation."""
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """(k,) coefficients by least squares, without some views."""
+        """(… + k,) coefficients by least squares, without some views; what the observation frees beside comes first."""
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
         """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
@@ -435,8 +435,8 @@ class LinearModel:
 
     def view_displacements(self) -> Array:
         """(V, 3) how far every view sits from where the model puts it, at the part, reference frame."""
-        explained = self.reduce((self.design @ self.baseline_trial.solve())[:, None])[:, 0]
-        return self.observation.part_displacements(self.mixed.z.ravel() - explained)
+        explained = self.design @ self.baseline_trial.solve()[-self.design.shape[1] :]
+        return self.observation.part_displacements(self.mixed.z.ravel() - self.reduce(explained[:, None])[:, 0])
 
     def __repr__(self) -> str:
         return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"

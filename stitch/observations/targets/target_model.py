@@ -8,7 +8,7 @@ from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.rows import row_model
+from stitch.observations.row_model import row_model
 from stitch.observations.targets.rows import Drawing, Landmarks, TargetRows, initial_landmarks, target_rows
 from stitch.session.measurement import Measurement
 from stitch.system.values import Value

@@ -7,6 +7,7 @@ import numpy as np
 
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.least_squares import column_space
+from stitch.numerics.reml import NOISE
 from stitch.observations.linear_model import LinearModel
 from stitch.plugins.explain.dictionary import Dictionary, Ingredient, scaled_values
 
@@ -40,14 +41,23 @@ class HalfModel:
 
     @cached_property
     def z(self) -> Array:
-        """(n,) what was seen."""
+        """(n,) what was seen; the last number stands for all that is the sensor's noise alone."""
         white = self._linear.white_z[self._rows]
-        return white - self._explained @ (self._explained.T @ white)
+        noise = self._noise[1] / self._linear.null.variances[NOISE]
+        return np.append(white - self._explained @ (self._explained.T @ white), np.sqrt(noise))
+
+    @property
+    def _noise(self) -> Array:
+        """(2,) numbers that are the sensor's noise alone, as many as these views have of all, and their square."""
+        share = len(self._keep) / self._linear.measurement.views.count
+        return share * np.array(self._linear.mixed.noise_only)
 
     @property
     def free(self) -> int:
         """Return how many of the numbers are free."""
-        return len(self.z) - int(self._explained.shape[1])
+        # What a view does not show has no variance.
+        shown = np.einsum("cbii->bi", self._linear.mixed.components).ravel()[self._rows] > 0
+        return int(shown.sum() + self._noise[0]) - int(self._explained.shape[1])
 
     def has_room(self, numbers: int = 1) -> bool:
         """True if these views can tell a sum of so many numbers from others, and leave numbers free beside it."""
@@ -61,7 +71,7 @@ class HalfModel:
     def residual_columns(self, response: Array) -> Array:
         """(n, k) whitened columns of a response (·, k), without what the model explains."""
         white = self._linear.whiten(self._linear.reduce(response), self._blocks)
-        return white - self._explained @ (self._explained.T @ white)
+        return np.pad(white - self._explained @ (self._explained.T @ white), ((0, 1), (0, 0)))
 
     def columns(self, ingredients: Sequence[Ingredient]) -> Array:
         """(n, k) of ingredients: from the response to each view's displacement alone, which is worked out once."""

@@ -141,5 +141,6 @@ def test_what_left_out_views_show_counts_as_many_squares_as_numbers_in_units_of_
     linear = target_model(measurement_of(session, prepare_capture(session)), Model(T_mount), None)
     trial = linear.baseline_trial
     squares = trial.scatter(np.arange(80), trial.solve())
-    numbers = linear.mixed.z.size
-    assert chi2.ppf(1e-4, numbers - linear.design.shape[1]) < squares < chi2.ppf(1 - 1e-4, numbers)
+    rows = linear.observation.rows
+    numbers = rows.used.sum()
+    assert chi2.ppf(1e-4, numbers - 6 - rows.landmarks.shape[2]) < squares < chi2.ppf(1 - 1e-4, numbers)

@@ -101,14 +101,15 @@ def test_columns_are_what_the_displacement_does():
     linear = evidence(4, views=20)
     terms = build_dictionary(linear, view_quantities(linear.measurement.views))
     own = next(i for i in terms.ingredients if i.what == "q*3" and i.quantity.text == "sin q3·sin 2q2")
-    column, scale = terms.columns([own])[:, 0], np.abs(own.quantity.values).max()
-    rows = linear.observation.residual.ravel()
-    moved = evidence(4, coupling, views=20).observation.residual.ravel()
+    scale, reduction = np.abs(own.quantity.values).max(), linear.observation.reduction
+    column = reduction.expand(linear.in_blocks(terms.columns([own])))[..., 0].ravel() / reduction.per_sigma.ravel()
+    rows = linear.observation.rows
+    moved = evidence(4, coupling, views=20).observation.rows.residual.ravel()
     # The fit of each session takes what hand-eye and targets can of it; what remains must be the column's remainder.
-    free = linear.design
-    left = moved - rows - column * scale * -SIZE
+    free = np.concatenate([rows.hand_eye, rows.landmarks], axis=2).reshape(len(column), -1)
+    left = moved - rows.residual.ravel() - column * scale * -SIZE
     rest = left - free @ np.linalg.lstsq(free, left, rcond=None)[0]
-    whole = moved - rows
+    whole = moved - rows.residual.ravel()
     whole = whole - free @ np.linalg.lstsq(free, whole, rcond=None)[0]
     assert np.linalg.norm(rest) < 0.05 * np.linalg.norm(whole)
 

@@ -114,9 +114,10 @@ def poses_to_add(run: RunData) -> Array:
     if targets is None or not run.terms:
         return np.zeros((0, run.measurement.views.joints.shape[1]))
     joints = nearby(run.measurement.views.joints)[:_TRIED]
-    _, columns, covariance = candidate_rows(
-        candidate_measurement(run.measurement, joints), targets.rows, targets.landmarks, targets.variances, run.terms
+    rows, columns = candidate_rows(
+        candidate_measurement(run.measurement, joints), targets.rows, targets.landmarks, run.terms
     )
+    covariance = rows.mixed_model(rows.hand_eye).covariance(targets.variances)
     sigmas = np.array([p.sigma for p in stack_parameters(run.terms)])
     keep = np.isfinite(sigmas)
     half = np.linalg.inv(np.linalg.cholesky(covariance))
