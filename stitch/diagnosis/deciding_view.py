@@ -150,7 +150,7 @@ def deciding_views(
 def unnamed_joints(linear: LinearModel, scores: Sequence[Score]) -> list[tuple[JointEffect, float]]:
     """Return what single joints may do that follow the pose by no known law, beside none of the rivals, the likeliest
     with their log posteriors; [] where the views tell of none."""
-    base = linear.restricted(linear.causes - {scored.name for scored in scores})
+    base = linear.without([scored.name for scored in scores])
     effects = joint_effects(base)
     followed = [effect for effect in effects if effect.follows in _BY_POSE][:_FORMS]
     factors = np.array([effect.log_bayes_factor for effect in followed])
@@ -528,7 +528,7 @@ def model_beside(linear: LinearModel, scored: Score) -> LinearModel:
     """Return the model with the variances that are left beside a candidate."""
     if scored.base_model is not None or scored.variances is None:
         return scored.base_model or linear
-    base = linear.restricted(linear.causes - {scored.name})
+    base = linear.without([scored.name])
     return replace(base, null=at_variances(base.mixed, scored.variances))
 
 

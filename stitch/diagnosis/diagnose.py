@@ -1,6 +1,5 @@
 """The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +23,7 @@ from stitch.diagnosis.sensitivity import (
 from stitch.diagnosis.sentences import diagnosis_sentence
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
 from stitch.diagnosis.unmodelled_joint_effects import joint_curves
-from stitch.diagnosis.unmodelled_time_effects import RepeatingError, find_repeating_errors, reportable
+from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors, reportable
 from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
 from stitch.fit.pipelines import linearise
@@ -69,7 +68,9 @@ def _diagnose(state: RunData) -> Diagnosis:
         repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.told_laws[:1]))
     reported = reportable(repeating, evidence.implausible_scatter)
     process = reported[0].process if reported else None
-    with_reported = _with_joint_effect(linear, reported)
+    # The joint that is said to err without a name may err so.
+    joint_effects = reported[0].joint_effects if reported else ()
+    with_reported = joint_effects[0].model if joint_effects else linear
     # Of the poses beside errors said to repeat, or else all of it.
     scattering = with_reported if reported else linear.restricted(())
     scatter = process.flange_scatter if process else scattering.flange_scatter(scattering.null)
@@ -140,12 +141,6 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
         )
 
     return list(parallel(examined, range(len(scores)), "candidate effects on views left out"))
-
-
-def _with_joint_effect(linear: LinearModel, reported: Sequence[RepeatingError]) -> LinearModel:
-    """Return the views where the joint that is said to err without a name may err so."""
-    effects = reported[0].joint_effects if reported else ()
-    return effects[0].model if effects else linear
 
 
 def _named_together(evidence: Evidence) -> tuple[str, ...]:

@@ -135,7 +135,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     first = contenders[0]
     while hidden := _hidden_contenders(case, contenders):
         contenders += hidden
-    base = _without(case.linear, contenders)
+    base = case.linear.without([r.name for r in contenders])
     if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
         contenders = [rescored_in(base, r) for r in contenders]
@@ -275,18 +275,13 @@ NAMING: tuple[Question, ...] = (
 )
 
 
-def _without(linear: LinearModel, effects: Sequence[Ranked]) -> LinearModel:
-    """Return the model in which none of the effects is among the errors that remain."""
-    return linear.restricted(linear.causes - {r.name for r in effects})
-
-
 def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]:
     """Return effects that could be named only where no contender is among the errors that remain: a base that gives
     way, or an uneven gear, explains nothing beside joints that may give way by as much as the views show."""
-    base = _without(case.linear, contenders)
+    known = {r.name for r in contenders}
+    base = case.linear.without(known)
     if base is case.linear:
         return []
-    known = {r.name for r in contenders}
     weak = [c for c in case.candidates if not c.empirical and c.name not in known]
     remaining = [c for c in weak if c.name in base.causes]
     likely = promising(base, [c for c in weak if c not in remaining], limits.CANDIDATES_TRIED)
@@ -338,7 +333,7 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
         tests: candidates among which the best is chosen.
     """
     families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
-    without_families = linear.restricted(linear.causes - set(families))
+    without_families = linear.without(families)
     if not families or without_families.null.deviance < linear.null.deviance:
         # No error of joints or links helps: none stands in for another.
         return ()
@@ -349,13 +344,13 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
         return ()
     asked = known[best.name]
     removed = {best.name}
-    while not is_certain(rank_one(linear.restricted(linear.causes - removed), asked, tests)):
+    while not is_certain(rank_one(linear.without(removed), asked, tests)):
         others = [name for name in families if name in known and name not in removed]
         if not others:
             return ()
-        bases = {name: linear.restricted(linear.causes - removed - {name}) for name in others}
+        bases = {name: linear.without(removed | {name}) for name in others}
         removed.add(max(others, key=lambda name: score(bases[name], asked).log_bayes_factor))
-    base = linear.restricted(linear.causes - removed)
+    base = linear.without(removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
     if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
         return ()

@@ -97,7 +97,7 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     Args:
         start: (c,) variances to begin with; None: those of the null, or where else their maximum may lie.
     """
-    base = linear.restricted(linear.causes - {candidate.name})
+    base = linear.without([candidate.name])
     regime = regime_of(base)
     starts = (base, *base.alternative_starts)
     at_starts = [_gains_at_null(base, at, candidate) for at in starts]

@@ -187,16 +187,20 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
 def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
     """Return the smallest detectable size of every free parameter of a candidate among so many, where it alone is not
     zero, by the form that shows it best."""
-    linear = linear.restricted(linear.causes - {candidate.name})
+    linear = linear.without([candidate.name])
     sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
-    whole: tuple[Array | None, Array] = (None, np.zeros((0, 0)))
+    scatter, scales = linear.satterthwaite, regime_of(linear).scales
+    has_singles = any(form.keep.sum() == 1 for form in candidate.forms)
+    reduced, whole, alone = None, np.zeros((0, 0)), np.zeros(0)
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        if whole[0] is not form.reduced:  # forms of one term follow each other
-            whole = form.reduced, linear.residual(form.reduced)
-        white = whole[1][:, form.keep]
+        if reduced is not form.reduced:  # forms of one term follow each other
+            reduced, whole = form.reduced, linear.residual(form.reduced)
+            alone = scatter.of_each(linear.in_blocks(whole)) if has_singles else alone
+        white = whole[:, form.keep]
         names = tuple(p.name for p in form.free)
-        known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
-        least = least_noncentrality(white * form.sizes, float(weight), tests, known, regime_of(linear).scales)
+        is_single = len(names) == 1
+        known = float(alone[form.keep][0]) if is_single else scatter.degrees_of_freedom(linear.in_blocks(white))
+        least = least_noncentrality(white * form.sizes, float(weight), tests, known, scales)
         for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
             sizes.setdefault(name, {}).setdefault(names, []).append(size)

@@ -122,7 +122,7 @@ def significant_time_effect(linear: LinearModel) -> FittedProcess | None:
     steady, wandering = linear, 0.0
     likeliest = likeliest_time_effect(linear)
     if likeliest is None or likeliest[1] <= limits.ODDS:
-        steady = linear.restricted(linear.causes - DRIFT)
+        steady = linear.without(DRIFT)
         likeliest = likeliest_time_effect(steady)
         wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
         if likeliest is None or likeliest[1] <= max(limits.ODDS, wandering):

@@ -7,7 +7,7 @@ the chain of frames carries them.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -144,9 +144,10 @@ def target_correction(
         return np.zeros(sightings.points.shape)
     places = target_places(measurement, terms, poses) if places is None else places
     to_sensor = frames.inverse(poses)
-    views = zip(measurement.target_views, places, to_sensor, strict=True)
-    moved = [_displaced(terms, of_view, view, T) for view, of_view, T in views]
-    apart = frames.transform(to_sensor, places) - np.array(moved)
+    shown = frames.transform(to_sensor, places)
+    grown = _displaced("shape", terms, measurement.target_views, places)
+    points = shown.copy() if grown is places else frames.transform(to_sensor, grown)
+    apart = shown - _displaced("sensor", terms, measurement.target_views, points)
     return np.where((sightings.target >= 0)[..., None], apart, 0.0)
 
 
@@ -180,18 +181,11 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
     return places
 
 
-def _displaced(terms: Sequence[Term], places: Array, view: ScanView, to_sensor: Array) -> Array:
-    """Return (N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, in its
-    frame.
-
-    Args:
-        to_sensor: (4, 4) T_scanner_reference of the view.
-    """
-    for term in (t for t in reversed(terms) if t.effect.place == "shape"):
-        places = term.effect.function(places, view, **term.arguments)
-    points = frames.transform(to_sensor, places)
-    for term in (t for t in reversed(terms) if t.effect.place == "sensor"):
-        points = term.effect.function(points, view, **term.arguments)
+def _displaced(place: str, terms: Sequence[Term], views: Sequence[ScanView], points: Array) -> Array:
+    """Return points (V, N, 3) of all views where the effects of one place put them, the last effect first."""
+    for term in (t for t in reversed(terms) if t.effect.place == place):
+        displace = partial(term.effect.function, **term.arguments)
+        points = np.array([displace(of_view, view) for of_view, view in zip(points, views, strict=True)])
     return points
 
 

@@ -134,8 +134,19 @@ class CommonCovariance:
             return self._turn(columns.whole)
         return [columns.of(part, 0) for part in self._kept(columns.whole)]
 
-    def _kept(self, whole: Array) -> list[Array]:
-        turned = self._turned.pop(id(whole), None) or self._turn(whole)
+    def keep(self, wholes: Sequence[Array]) -> None:
+        """Turn sets of columns that will be asked for, at once: so many small products take longer one by one."""
+        new = [
+            whole for whole in wholes if id(whole) not in self._turned and (id(whole), id(whole)) not in self._products
+        ]
+        if len(new) > 1:
+            ends = np.cumsum([whole.shape[1] for whole in new])[:-1]
+            parts = [np.split(part, ends) for part in self._turn(np.hstack(new))]
+            for whole, *turned in zip(new, *parts, strict=True):
+                self._kept(whole, turned)
+
+    def _kept(self, whole: Array, turned: list[Array] | None = None) -> list[Array]:
+        turned = turned or self._turned.pop(id(whole), None) or self._turn(whole)
         self._wholes[id(whole)] = whole
         self._turned[id(whole)] = turned
         self._sizes[id(whole)] = sum(part.size for part in turned)

@@ -75,6 +75,13 @@ class Satterthwaite:
         shares = self.white.reshape(len(self.white), -1) @ along / directions.shape[2]
         return float(min(2 / max(shares @ self.spread @ shares, 2 / _MANY), _MANY))
 
+    def of_each(self, white: Array) -> Array:
+        """The same (p,) along each of the columns by itself."""
+        squares = np.sum(white**2, axis=(0, 1))
+        shares = np.einsum("bmp,cbmp->cp", white, self.white @ white) / np.maximum(squares, 1e-300)
+        known = 2 / np.maximum(np.sum(shares * (self.spread @ shares), axis=0), 2 / _MANY)
+        return np.where(squares > 0, known, _MANY)
+
 
 def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     """From the fit without the columns that are asked for."""

@@ -234,6 +234,10 @@ class LinearModel:
             self._restricted[kept] = self._fit_restricted(kept)
         return self._restricted[kept]
 
+    def without(self, causes: Collection[str]) -> Self:
+        """Return the model in which poses do not err by these causes."""
+        return self.restricted(self.causes.difference(causes))
+
     @cached_property
     def _restricted(self) -> dict[frozenset[str], Self]:
         """What `restricted` has fitted already."""
@@ -272,7 +276,9 @@ class LinearModel:
         """
         if self.pose_errors is None:
             return ()
-        whole = self.full_model or self
+        whole: LinearModel = self
+        while whole.full_model is not None:
+            whole = whole.full_model
         few = _NEGLIGIBLE_SHARE * self.pose_errors.scales**2
         starts = [np.append(fit.variances[: NOISE + 1], few) for fit in (whole.restricted(()).null, self.null)]
         if self.full_model is not None and self.full_model.pose_errors is not None:
@@ -325,11 +331,13 @@ class LinearModel:
         It is I (P, P) and v (P,) of the log likelihood vᵀθ − ½ θᵀIθ. Where sums of the model's own columns are kept,
         so are those of these.
         """
-        if self.mixed.common is not None and self.mixed.sums.are_kept:
-            yield from map(self._own_information.of, columns)
-            return
-        for start in range(0, len(columns), _SETS_AT_ONCE):
-            portion = [selected.columns for selected in columns[start : start + _SETS_AT_ONCE]]
+        common = self.mixed.common if self.mixed.common is not None and self.mixed.sums.are_kept else None
+        for sets in (columns[start : start + _SETS_AT_ONCE] for start in range(0, len(columns), _SETS_AT_ONCE)):
+            if common is not None:
+                common.keep([selected.whole for selected in sets])
+                yield from map(self._own_information.of, sets)
+                continue
+            portion = [selected.columns for selected in sets]
             white = self.whiten(np.hstack(portion))
             explained = self._explained.T @ white
             vector = white.T @ self.white_residual

@@ -127,7 +127,7 @@ def effect_pairs(linear: LinearModel, candidates: Sequence[Candidate]) -> list[E
     pairs = []
     for i, a in enumerate(candidates):
         for b in candidates[i + 1 :]:
-            base = linear.restricted(linear.causes - {a.name, b.name})
+            base = linear.without([a.name, b.name])
             pairs.append(EffectPair(a.name, b.name, identifiable_size(base, a, b), identifiable_size(base, b, a)))
     return sorted(pairs, key=lambda pair: -pair.size)
 
@@ -202,7 +202,7 @@ class ExpectedDiagnosis:
         """A candidate where some effects are none of the errors that remain."""
         key = frozenset(removed & self._of_arm), candidate.name
         if key not in self._tests:
-            linear = self.linear.restricted(self.linear.causes - removed)
+            linear = self.linear.without(removed)
             forms = (
                 _form_test(linear, scale * form.columns * form.sizes, float(weight), self.tests, share)
                 for form, weight in zip(candidate.forms, form_weights(candidate), strict=True)
@@ -252,7 +252,7 @@ class ExpectedDiagnosis:
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
     form = candidate.forms[0]
-    white = linear.restricted(linear.causes - {candidate.name}).residual(form.columns) * form.sizes
+    white = linear.without([candidate.name]).residual(form.columns) * form.sizes
     return bool((np.linalg.norm(white, axis=0) > limits.SEEN_SIGMAS).any())
 
 
