@@ -10,6 +10,7 @@ from markupsafe import escape
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
 from stitch.diagnosis.sentences import fitted_amounts, posterior_text
+from stitch.diagnosis.systematic_laws import law_of
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
@@ -167,6 +168,8 @@ def _typed(command: str) -> str:
 def _machine(found: Diagnosis, screen: dict[str, Any], state: RunData) -> str:
     """Return the machine with what errs marked; after an effect was added what it cures."""
     of = screen["why"]["of"] if screen["why"] is not None else ""
+    if found.verdict == "unknown_effect" and found.laws:
+        of = law_of(found.laws[0]).place.name
     drawing = machine_svg(state, of, found.linear.observation.centre)
     if not drawing:
         return ""

@@ -3,6 +3,7 @@
 The page of a run, its review and the first tab of its recording draw from this part of diagnosis.json alone.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -41,6 +42,8 @@ _FINE = 1e-3
 _WORSE = 0.03
 # What an effect changes over the views by less than this share of its size is the same in all.
 _FLAT = 0.02
+# A parameter of so many sigmas is clear, and so many links are told by their numbers.
+_CLEAR, _MOST_LINKS = 5.0, 2
 # A chance that needs no number.
 _PLAIN_CHANCE = 0.5
 _NAMING = ("missing_effect", "cannot_tell")
@@ -367,8 +370,18 @@ def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
         return f"{trend.moves.capitalize()} {JOINT_DESCRIPTIONS[name]}{when}"
     if view and name not in EVENTS:
         return f"{name} at {view}"
+    if name == "link_geometry" and (links := _clear_links(candidate)):
+        return f"Link {' and '.join(links)} of the arm {'is' if len(links) == 1 else 'are'} not as stated"
     description = EVENTS[name] + when if view else DESCRIPTIONS.get(name, name)
     return description[:1].upper() + description[1:]
+
+
+def _clear_links(candidate: CandidateEffect) -> list[str]:
+    """Return the numbers of the links that are clearly off; none where they are more than two."""
+    scored = candidate.ranked.score
+    sized = zip(scored.form.free, scored.values, scored.sigmas, strict=True)
+    clear = {re.sub(r"\D", "", p.name) for p, value, sigma in sized if abs(value) > _CLEAR * sigma}
+    return sorted(clear) if len(clear) <= _MOST_LINKS else []
 
 
 def _proof(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
@@ -394,8 +407,8 @@ def _size(why: EffectTrend, unit: str) -> str:
     """Return how far off an effect puts things, as a sentence."""
     largest = float(np.abs(why.effect).max())
     size = angle_text(largest, 2) if why.value_unit == "rad" else length_text(largest, unit, 2)
-    if why.follows == "view order" and len(why.views):
-        away = int(np.sum(np.abs(why.effect) > largest / 2))
+    away = int(np.sum(np.abs(why.effect) > largest / 2))
+    if why.follows == "view order" and away <= len(why.views) / 2:
         return f"{away} of {len(why.views)} views sit {size} away from the others."
     follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
