@@ -62,7 +62,7 @@ MEET_MM, _NEIGHBOURS = 0.25, 8
 NEAR_MM, SIZE = 0.05, 5e-3
 # OpenGL's axes, and what a refusal has to say where it is right.
 OTHER_HAND_EYES = {"nerfstudio_transforms": np.diag([1.0, -1.0, -1.0, 1.0])}
-TRUE_CAUSES = {"tool_changed_midway": r"changed at scan_06\.ply: .* by \((-?0\.\d), (-?0\.\d), (149\.\d|150\.\d)\) mm"}
+TRUE_CAUSES = {"tool_changed_midway": r"changed at scan_06\.ply, by \((-?0\.\d), (-?0\.\d), (149\.\d|150\.\d)\) mm"}
 # Where the true hand-eye is another, a wrist that never turns leaves it open, or nothing of a run can be judged by it.
 TURNTABLE = "turntable_names_only"
 NO_HAND_EYE = (

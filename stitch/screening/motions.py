@@ -97,6 +97,12 @@ def rotation_angles(T: Array) -> Array:
     return np.arccos(np.clip((np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
 
 
+def alike(T: Array, other: Array, length: float) -> Mask:
+    """Return (M,) True for motions (M, 4, 4) that differ by no more than one may leave open: `length`, length_unit."""
+    off = frames.inverse(T) @ other
+    return np.asarray((rotation_angles(off) < ROTATION) & (np.linalg.norm(off[:, :3, 3], axis=1) < length))
+
+
 def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
     """Return the first hypothesis, and what could close: motions keep their angle under any hand-eye (Chen 1991)."""
     v, w = np.array(motions.pairs).T

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Mask
 from stitch.plugins.intake.clock_times import rows_by_time
 from stitch.plugins.intake.refusals import Fix, Refusal
 
@@ -41,6 +41,21 @@ class Pairing:
         """Return the pairing of some of the clouds; those whose row holds no pose have none."""
         rows = tuple(self.rows[i] for i in clouds)
         return replace(self, rows=tuple(None if row in without_pose else row for row in rows))
+
+    def one_session_each(self, kept: Sequence[int], clouds: int, later: Mask) -> list[Fix]:
+        """Return the advice to make one session of the first views, and one of the later ones.
+
+        Args:
+            kept: numbers of the views among so many clouds.
+        """
+        of_cloud = dict(zip(kept, zip(self.rows, later, strict=True), strict=True))
+        each = [of_cloud.get(i, (None, False)) for i in range(clouds)]
+        fixes = []
+        for side, told in enumerate(("make one session of the first scans", "another of the others")):
+            rows = ",".join(str(row + 1) if row is not None and is_later == side else "-" for row, is_later in each)
+            name = ("before", "after")[side]
+            fixes.append(Fix(f"{told}, --rows={rows} -o {name}", {"rows": rows, "output": name}))
+        return fixes
 
 
 def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None) -> list[Pairing]:

@@ -20,7 +20,7 @@ from stitch.screening.background import find_standing_scene
 from stitch.screening.closing import CLEARLY_BETTER, fit_centroids, surface_misfit
 from stitch.screening.conventions import equivalent_hypotheses, fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
-from stitch.screening.motions import FEWEST, ROTATION, TRANSLATION_M, RelativeScans, rotation_angles
+from stitch.screening.motions import FEWEST, TRANSLATION_M, RelativeScans, alike
 from stitch.session.capture import Capture
 from stitch.session.session import Mount
 from stitch.system.process import steps
@@ -355,8 +355,7 @@ def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decid
     T = motions().T
     if len(T) < FEWEST:
         return
-    moved = np.linalg.norm(T[:, :3, 3], axis=1)
-    still = float(((rotation_angles(T) < ROTATION) & (moved < TRANSLATION_M / MM)).mean())
+    still = float(alike(T, np.eye(4), TRANSLATION_M / MM).mean())
     if still > max(0.5, decided.best.closed or 0.0):
         raise Refusal(
             f"{folder}: {still:.0%} of neighbouring scans meet as they are, and not as the poses say: they lie in one "

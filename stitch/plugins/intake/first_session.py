@@ -56,7 +56,8 @@ from stitch.plugins.intake.scan_targets import find_folder_targets, target_motio
 from stitch.plugins.intake.session_guesses import session_guesses
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.plugins.intake.stops import rows_with_scans
-from stitch.plugins.intake.sudden_change import groups_apart, require_no_change, require_one_part
+from stitch.plugins.intake.sudden_change import require_no_change
+from stitch.plugins.intake.two_parts import groups_apart, require_one_part
 from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
@@ -235,7 +236,7 @@ def _decide(
     apart = groups_apart(capture, decided.best) if decided.determined else None
     if (apart or not closes) and len(pairs[0].used) == len(found.clouds):
         ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
-        require_no_change(every.clouds, motions(), ways, kept)
+        require_no_change(every.clouds, (capture, kept, motions()), ways, decided.best)
     if apart:
         require_one_part(every.clouds, apart, decided.best, kept)
     layout = decided.best.interpretation.reading.layout

@@ -15,13 +15,16 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.plugins.intake import sudden_change
 from stitch.plugins.intake.cloud_pairs import Pairing
-from stitch.plugins.intake.convention_choice import Interpretation
+from stitch.plugins.intake.convention_choice import ConventionScore, Interpretation
+from stitch.plugins.intake.first_session import capture_of
 from stitch.plugins.intake.folder_files import find_folder_files
 from stitch.plugins.intake.layouts import MM, possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import readings
 from stitch.plugins.intake.sudden_change import require_no_change
+from stitch.screening.closing import surface_misfit
 from stitch.screening.motions import TRANSLATION_M, RelativeScans, fit_motions
+from stitch.session.session import Cloud
 
 R = Rotation.random(5, np.random.default_rng(1))
 P = np.random.default_rng(2).uniform(300, 800, (5, 3))
@@ -120,48 +123,79 @@ def test_rows_that_are_all_alike_and_columns_of_other_names_are_no_poses(scans):
     assert reasons["links.json"] == "all its rows are alike"
 
 
-def campaign(tool=None, base=None, views=slice(5, None)):
-    """Ways to read ten poses, changed at some of them, and the exact motions of the scans."""
+def scanned(T, cylinder=False):
+    """Scans of a lumpy body, or of a cylinder about x, from poses (V, 4, 4) of the scanner."""
+    random = np.random.default_rng(6)
+    outwards = random.normal(size=(8_000, 3)) * ([0, 1, 1] if cylinder else 1)
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    x, y, z = outwards.T
+    body = (
+        60 * outwards if cylinder else outwards * (60 + 9 * np.sin(3 * x + 1) + 8 * np.cos(4 * y) + 7 * x * z)[:, None]
+    )
+    body = body + random.uniform(-80, 80, (8_000, 1)) * [cylinder, 0, 0]
+    seen = [body[(pose[:3, 3] * outwards).sum(axis=1) > 120] for pose in T]
+    return capture_of([Cloud(frames.transform(frames.inverse(P), p)) for P, p in zip(T, seen, strict=True)], 1.0)
+
+
+def campaign(tool=None, base=None, views=slice(5, None), slid=None):
+    """Scans of ten poses, the motions between them, exact or slid from the sixth on, ways to read the poses, changed at
+    some, and the best of them as it stands."""
     random = np.random.default_rng(5)
-    T = frames.make(Rotation.random(10, random).as_matrix(), random.uniform(-400, 400, (10, 3)))
+    away = random.normal((0.0, 0.0, 1.0), 0.25, size=(10, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    R = [Rotation.align_vectors([-a], [[0, 0, 1]])[0] * Rotation.from_rotvec([0, 0, i]) for i, a in enumerate(away)]
+    poses = frames.make(np.array([r.as_matrix() for r in R]), 350 * away)
+    capture = scanned(poses, cylinder=slid is not None)
+    T = poses @ frames.inverse(X)
+    if slid is not None:
+        poses[5:] = slid @ poses[5:]
     pairs = [(v, v + step) for step in (1, 2) for v in range(10 - step)]
-    motions = np.array([frames.inverse(T[v] @ X) @ T[w] @ X for v, w in pairs])
+    motions = np.array([frames.inverse(poses[v]) @ poses[w] for v, w in pairs])
     written = T.copy()
     written[views] = (np.eye(4) if base is None else base) @ T[views] @ (np.eye(4) if tool is None else tool)
     raw = RawPoses("poses", None, written.reshape(-1, 16), ((),) * 10, "")
     (layout,) = possible_layouts(raw)
     pairing = Pairing(tuple(range(10)), "", True)
     ways = [Interpretation(readings(layout)[0], pairing, "mm", carries) for carries in (True, False)]
-    return RelativeScans(tuple(pairs), motions), ways
+    fit = surface_misfit(capture, ways[0].hypothesis(0), [X])
+    best = ConventionScore(ways[0], fit.T_mount, fit.misfit, fit.meets, None)
+    return (capture, range(10), RelativeScans(tuple(pairs), motions)), ways, best
 
 
 def test_each_group_is_stated_with_its_rows_where_a_cloud_shows_nothing():
     """The clouds are eleven, of which the first is empty, and the rows begin with its own."""
     change = frames.make(np.eye(3), np.array([0.0, 0.0, 150.0]))
-    motions, ways = campaign(tool=change)
+    (capture, _, motions), ways, best = campaign(tool=change)
     ways = [replace(way, pairing=Pairing(tuple(range(1, 11)), "", True)) for way in ways]
     for way in ways:
         object.__setattr__(way.reading, "T", np.concatenate([np.eye(4)[None], way.reading.T]))
     with pytest.raises(InputError) as refused:
-        require_no_change([Path("cell/empty.ply"), *CLOUDS], motions, ways, range(1, 11))
+        require_no_change([Path("cell/empty.ply"), *CLOUDS], (capture, range(1, 11), motions), ways, best)
     assert [fix.options["rows"] for fix in refused.value.fixes] == ["-,2,3,4,5,6,-,-,-,-,-", "-,-,-,-,-,-,7,8,9,10,11"]
 
 
 def test_poses_without_a_change_are_let_through():
-    require_no_change(CLOUDS, *campaign(), range(10))
+    require_no_change(CLOUDS, *campaign())
+
+
+def test_scans_of_a_cylinder_that_register_slid_and_turned_on_it_show_no_change():
+    """With a change of the base undone all motions close; the scans lie on each other as well without."""
+    slid = frames.make(Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix(), np.array([25.0, 0.0, 0.0]))
+    require_no_change(CLOUDS, *campaign(slid=slid))
 
 
 @pytest.mark.parametrize("side", ["tool", "base"])
 def test_a_change_is_named_with_its_view_and_its_size(side):
     change = frames.make(np.eye(3), np.array([0.0, 0.0, 150.0]))
     with pytest.raises(InputError, match="changed at scan_05.ply") as refused:
-        require_no_change(CLOUDS, *campaign(**{side: change}), range(10))
+        require_no_change(CLOUDS, *campaign(**{side: change}))
     assert "150.0) mm and 0.00°" in str(refused.value) and "100% of the scanner's motions close" in str(refused.value)
 
 
 def test_of_the_first_few_views_the_others_changed():
     """Which half is smaller is chance: what is named is the view at which it changed."""
-    motions, ways = campaign(base=frames.make(np.eye(3), np.array([0.0, 30.0, 150.0])), views=slice(0, 4))
+    base = frames.make(np.eye(3), np.array([0.0, 30.0, 150.0]))
+    (_, _, motions), ways, _ = campaign(base=base, views=slice(0, 4))
     fit = fit_motions(ways[0].hypothesis(0), motions, TRANSLATION_M / MM)
     halves = [later for later in sudden_change._groups(fit, motions) if later[:4].all() != later[4:].all()]
     assert halves and not any(later[0] for later in halves)
@@ -173,7 +207,7 @@ def test_of_the_first_few_views_the_others_changed():
 def test_two_lists_in_one_table_are_named_with_their_views(side, views):
     change = frames.make(np.eye(3), np.array([0.0, 30.0, 150.0]))
     with pytest.raises(InputError, match="two lists of poses are mixed") as refused:
-        require_no_change(CLOUDS, *campaign(**{side: change}, views=views), range(10))
+        require_no_change(CLOUDS, *campaign(**{side: change}, views=views))
     named = {cloud.name for cloud in CLOUDS if cloud.name in str(refused.value)}
     changed = {CLOUDS[i].name for i in np.arange(10)[views]}
     assert named in (changed, {cloud.name for cloud in CLOUDS} - changed)
