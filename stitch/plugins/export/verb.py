@@ -9,6 +9,7 @@ from stitch.errors import InputError, did_you_mean
 from stitch.output.diagnosis_document import diagnosis_document
 from stitch.output.result_document import model_of, result_document, scanner_documents
 from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
+from stitch.plugins.export.formats import Arm, Cloud, HandEye
 from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from, session_of_scanner
 from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
 from stitch.run_data import RunData
@@ -17,7 +18,7 @@ from stitch.system.files import whole_file
 
 def export_run(
     run: RunData,
-    to: str,
+    to: HandEye | Arm | Cloud,
     file: Path | str | None = None,
     *,
     parent: str | None = None,

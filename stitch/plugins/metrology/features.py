@@ -7,7 +7,7 @@ implicit derivative of the normal equations, for residuals that are small agains
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -19,7 +19,8 @@ from stitch.plugins.metrology.place_errors import RunPoints
 from stitch.system.values import Value
 
 # What a feature is, and the numbers that are told of it; the first is the one that a tolerance is of.
-NUMBERS = {
+Kind = Literal["point", "deviation", "plane", "sphere", "cylinder", "circle", "distance"]
+NUMBERS: dict[Kind, tuple[str, ...]] = {
     "point": ("deviation",),
     "deviation": ("deviation",),
     "plane": ("offset", "slope_u", "slope_v"),
@@ -49,9 +50,9 @@ class Feature(Value):
     """
 
     name: str
-    kind: str
-    at: Array = field(default_factory=lambda: np.zeros(3))  # (3,) nominal place
-    axis: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit: normal or axis
+    kind: Kind
+    at: Any = field(default_factory=lambda: np.zeros(3))  # (3,) nominal place
+    axis: Any = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit: normal or axis
     size: float = 0.0  # nominal diameter
     radius: float = 0.0  # of the patch of a point, plane or deviation; half the length of a cylinder
     within: float = 0.0  # points count up to this distance from the nominal surface
