@@ -40,7 +40,6 @@ def jobs(seeds: range, faulty: int = 8) -> Iterator[Row]:
             for how in ("off by 1", "unknown"):
                 yield {"part": "found", "kind": kind, "how": how, "seed": seed}
         yield {"part": "found", "kind": "arm", "how": "no axis", "seed": seed}
-        yield {"part": "ball", "seed": seed}
         for kind, fault, amplitude in FAULTS if seed < seeds.start + faulty else ():
             yield {"part": "named", "kind": kind, "fault": fault, "amplitude": amplitude, "seed": seed}
 
@@ -92,6 +91,9 @@ def found(job: Row) -> Row:
     if job["how"] != "unknown":
         diagnosis = stitch.diagnose(run)
         row |= {"verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+    if job["kind"] == "turntable" and job["how"] != "unknown":
+        row |= {"ball": _by_ball(cell, job["seed"]), "ours": _off(cell, run.axes[0].direction, run.axes[0].point)}
+        row["ours"].append(row["model"])
     return row
 
 
@@ -117,30 +119,24 @@ def named(job: Row) -> Row:
     return {"verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
 
 
-def ball(job: Row) -> Row:
-    """Return how far a turntable's axis and the blade's cloud are off, by ball and circle, and by the blade itself."""
-    cell, blade = axis_cell("turntable", job["seed"], ball=True), axis_cell("turntable", job["seed"])
-    centres = np.array([_ball_centre(cloud.points) for cloud in cell.clouds])
+def _by_ball(blade: AxisCell, seed: int) -> list[float]:
+    """How far a turntable's axis and the blade's cloud are off, by a ball and a circle through its centres."""
+    centres = np.array([_ball_centre(cloud.points) for cloud in axis_cell("turntable", seed, ball=True).clouds])
     middle = centres.mean(axis=0)
     normal = np.linalg.svd(centres - middle)[2][2]
     plane = np.linalg.svd(normal[None])[2][1:]
     flat = (centres - middle) @ plane.T
     x = np.linalg.lstsq(np.column_stack([2 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
     point = middle + x[:2] @ plane
-    true, at = blade.in_scanner(blade.axes[0])
-    normal = normal * np.sign(normal @ true)
+    normal = normal * np.sign(normal @ blade.in_scanner(blade.axes[0])[0])
     A = [frames.exp(np.append(normal * -q, np.cross(point, normal * -q))) for q in blade.readings[:, 0]]
-    run = _run(blade, _stated(blade, job["seed"], known=True))
-    place = run.axes[0]
-    return {
-        "ball": [*_off(normal, point, true, at), cloud_error(blade, np.array(A))],
-        "ours": [*_off(place.direction, place.point, true, at), cloud_error(blade, run.poses_model)],
-    }
+    return [*_off(blade, normal, point), cloud_error(blade, np.array(A))]
 
 
-def _off(direction: Array, point: Array, true: Array, at: Array) -> list[float]:
+def _off(cell: AxisCell, normal: Array, point: Array) -> list[float]:
     """Angle in mrad, and distance in µm from the true axis."""
-    offs = np.cross(direction, true), np.cross(true, point - at)
+    true, at = cell.in_scanner(cell.axes[0])
+    offs = np.cross(normal, true), np.cross(true, point - at)
     return [1e3 * float(np.linalg.norm(off)) for off in offs]
 
 
@@ -168,7 +164,7 @@ def _found_lines(rows: list[Row]) -> list[str]:
     head = (
         "cell | axis stated | placed | axis within 3 σ | hand-eye within 3 σ | cloud, µm | by the model, µm | adequate"
     )
-    return markdown(head, table)
+    return [*markdown(head, table), "", *_ball_lines([row for row in rows if "ball" in row])]
 
 
 def _named_lines(rows: list[Row]) -> list[str]:
@@ -188,5 +184,5 @@ def _ball_lines(rows: list[Row]) -> list[str]:
     return markdown("turntable placed by | direction, mrad | place, µm | cloud by the model, µm", table)
 
 
-_PARTS = Parts({"found": (found, _found_lines), "named": (named, _named_lines), "ball": (ball, _ball_lines)})
+_PARTS = Parts({"found": (found, _found_lines), "named": (named, _named_lines)})
 TABLE = Table(jobs, _PARTS.trial, _PARTS.summary, range(200, 220), page="axes", block="axes", settings={"faulty": 8})

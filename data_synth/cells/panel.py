@@ -20,6 +20,7 @@ RADIUS, SPAN, LENGTH = 2960.0, 2048.0, 3100.0
 NAMES = ("A", "B", "C", "D", "E", "F")
 _COMPLIANT = np.tile([False, False, True, True, True, False], 6)  # turn about z, then x and y
 _ROTATION_FIRST = np.array([0.0, 0.0, -9810.0])
+_STEEL, _WARMS = 11.5e-6, 20.0  # growth 1/K of a leg; moves in which two thirds of its warmth come
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Sizes:
     clamp: tuple[float, float] = (3.0, 0.5)  # mm, deg: clamps on their flanges
     leg: float = 0.004  # mm, repeatability of one leg
     joint: float = 0.0  # mm, along each axis, of every joint of base and platform against the controller's
+    bend: float = 0.0  # mm/N, what a leg gives under the panel
+    warm: float = 0.0  # K, by which the legs warm up in the end, two thirds of it within twenty moves
     tracker: tuple[float, float] = (0.010, 5e-6)
     laid: tuple[float, float] = (4.0, 0.12)  # mm, deg: the panel as it is laid on the clamps
     spring_in: float = 9.0  # mm at the panel's long edges, against the CAD
@@ -62,6 +65,7 @@ class PanelCell:
         self.T_world_base = upright @ home @ frames.exp(self._scatter(*self.sizes.base, 6))
         self.T_base_flange = np.tile(frames.make(np.eye(3), [0.0, 0.0, hexapod.HOME_HEIGHT]), (6, 1, 1))
         self.held: HeldShell | None = None
+        self.moves = 0
         # Streams of their own: a cell without such errors is the same cell.
         off = self.sizes.joint * np.random.default_rng([self.seed, 5]).standard_normal((2, 6, 6, 3))
         self.base_joints, self.platform_joints = hexapod.BASE + off[0], hexapod.PLATFORM + off[1]
@@ -83,10 +87,31 @@ class PanelCell:
 
     def drive(self, T_base_flange: Array) -> None:
         """All robots to poses (6, 4, 4); the legs do what they can."""
-        for i, T in enumerate(T_base_flange):
-            wrong = self.leg_offsets[i] + self.sizes.leg * self.rng.standard_normal(6)
-            joints = self.base_joints[i], self.platform_joints[i]
-            self.T_base_flange[i] = hexapod.forward(hexapod.lengths(T) + wrong, T, *joints)
+        self.moves += 1
+        grown = _STEEL * self.sizes.warm * (1 - np.exp(-self.moves / _WARMS))
+        lengths = np.array([hexapod.lengths(T) for T in T_base_flange])
+        self._legs = lengths * (1 + grown) + self.leg_offsets + self.sizes.leg * self.rng.standard_normal((6, 6))
+        self._stand(self._legs, T_base_flange)
+        self._give()
+
+    def _give(self) -> None:
+        """The legs give under the panel, which changes what it does to them: by much less than they give."""
+        for _ in range(3 if self.sizes.bend and self.held is not None else 0):
+            self._stand(self._legs + self.sizes.bend * self._leg_forces(), self.T_base_flange.copy())
+
+    def _stand(self, lengths: Array, guess: Array) -> None:
+        for i, (legs, T) in enumerate(zip(lengths, guess, strict=True)):
+            self.T_base_flange[i] = hexapod.forward(legs, T, self.base_joints[i], self.platform_joints[i])
+
+    def _leg_forces(self) -> Array:
+        """(6, 6) N, pulling out, by robot and leg: what a clamp's twist makes of the lengths, against its wrench."""
+        wrench = self._baseline.reshape(6, 6) + self.state()[2]
+        T_flange_contact = frames.inverse(self.T_world_base @ self.T_base_flange) @ self.clamps()
+        out = np.zeros((6, 6))
+        for i, (T, X) in enumerate(zip(self.T_base_flange, T_flange_contact, strict=True)):
+            ends = [hexapod.lengths(T @ X @ frames.exp(d) @ frames.inverse(X)) for d in 1e-6 * np.eye(6)]
+            out[i] = np.linalg.solve((np.array(ends) - hexapod.lengths(T)) / 1e-6, wrench[i])
+        return out
 
     def see(self, points: Array) -> Array:
         """The tracker's readings of true points (..., 3), world frame."""
@@ -120,6 +145,7 @@ class PanelCell:
         self._sag, self._moves = self.held.sag(load), self._pad_moves(world, shell, xs)
         self._response = self.held.response(self._moves)
         self._stiffness, self._baseline = self._wrench(self._response, self._moves), self._wrench(self._sag, 0.0)
+        self._give()
 
     def _pad_moves(self, world: Array, shell: Shell, xs: Array) -> Array:
         """(54, 36): displacement of the pads along u, v, w per clamp twist."""

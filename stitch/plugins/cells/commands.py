@@ -114,6 +114,12 @@ def fit(
             metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
         ),
     ] = None,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow", help="Then answer each table of scans named on standard input with the part's pose, JSON."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
@@ -122,12 +128,19 @@ def fit(
     Examples:
       stitch fit fit.toml --report page.html
       stitch fit casting.toml --allowance free
+      scan-again | stitch fit body.toml --follow | correct-path
     """
     from stitch.plugins.cells.job_files import Wanted
     from stitch.plugins.cells.window import run_fit
 
+    wanted = Wanted(output, recording, report, session, as_json)
+    if follow:
+        from stitch.plugins.cells.follow import run_follow
+
+        run_follow(file, allowance, wanted)
+        return
     with tell_seconds("fit: the scans onto the CAD model"):
-        run_fit(file, allowance, Wanted(output, recording, report, session, as_json))
+        run_fit(file, allowance, wanted)
 
 
 def seam(

@@ -191,7 +191,7 @@ def _contact_jacobian(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class MotionErrors:
-    """Rms over the draws, for D distances or angles along each of the three axes of the master's base."""
+    """Rms, for D distances or angles along each of the three axes of the master's base."""
 
     steps: Array  # (D,) mm or rad
     position: Array  # (3, D, N) mm, contact frame of each robot against the master's
@@ -199,27 +199,24 @@ class MotionErrors:
 
 
 def errors_along_motion(
-    models: Sequence[RobotModel], T_base_flange: Array, master: int, steps: Array, *, turn: bool, draws: int = 200
+    models: Sequence[RobotModel], T_base_flange: Array, master: int, steps: Array, *, turn: bool
 ) -> MotionErrors:
     """Return the rms change of the relative pose of each slave's contact frame, per axis and step.
 
-    The true cell is drawn about the model from each robot's covariance; commands come from the model alone.
+    In closed form, to first order (source, eqs. 19-24): with bases at T_world_base·exp(ξ) a contact frame C of its base
+    is off by Ad(C⁻¹) ξ, of which a motion changes D = Ad(C'⁻¹) − Ad(C⁻¹). A slave errs by D ξ less the master's D ξ in
+    its own frame; what the clamps are off is the same before and after.
 
     Args:
         T_base_flange: (N, 4, 4) where the robots stand.
         steps: (D,) distances in mm, or angles in rad if `turn`; a turn is about the master's flange.
     """
-    rng = np.random.default_rng(0)
-    xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)
     T_world_base = np.array([model.T_world_base for model in models])
-    true_base = T_world_base @ frames.exp(xi[..., :6])
-    true_contact = np.array([model.T_flange_contact for model in models]) @ frames.exp(xi[..., 6:])
-
-    def relative(flanges: Array) -> Array:
-        contact = true_base @ flanges @ true_contact
-        return frames.inverse(contact[:, master : master + 1]) @ contact
-
-    before = frames.inverse(relative(T_base_flange))
+    T_flange_contact = np.array([model.T_flange_contact for model in models])
+    covariance = np.array([model.covariance[:6, :6] for model in models])
+    contact = T_world_base @ T_base_flange @ T_flange_contact
+    from_master = frames.adjoint(frames.inverse(contact) @ contact[master])
+    before = frames.adjoint(frames.inverse(T_base_flange @ T_flange_contact))
     position, angle = np.zeros((2, 3, len(steps), len(models)))
     for axis in range(3):
         for k, step in enumerate(steps):
@@ -227,9 +224,14 @@ def errors_along_motion(
             T_master = T_base_flange[master].copy()
             T_master[:3, :3] = motion[:3, :3] @ T_master[:3, :3]
             T_master[:3, 3] += motion[:3, 3]
-            change = frames.log(before @ relative(follow(T_world_base, T_base_flange, master, T_master)))
-            position[axis, k] = np.sqrt((change[..., 3:] ** 2).sum(axis=-1).mean(axis=0))
-            angle[axis, k] = np.sqrt((change[..., :3] ** 2).sum(axis=-1).mean(axis=0))
+            moved = follow(T_world_base, T_base_flange, master, T_master)
+            D = frames.adjoint(frames.inverse(moved @ T_flange_contact)) - before
+            spread = D @ covariance @ D.transpose(0, 2, 1)
+            spread = spread + from_master @ spread[master] @ from_master.transpose(0, 2, 1)
+            spread[master] = 0
+            variance = np.diagonal(spread, axis1=1, axis2=2)
+            position[axis, k] = np.sqrt(variance[:, 3:].sum(axis=1))
+            angle[axis, k] = np.sqrt(variance[:, :3].sum(axis=1))
     return MotionErrors(steps, position, angle)
 
 

@@ -1,6 +1,7 @@
 """Scan onto CAD, seam and the whole window line: known meshes in known poses; truth from them, not from the package."""
 
 import csv
+import io
 import json
 import re
 from dataclasses import replace
@@ -20,6 +21,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells.cad import Box, Regions, cad_surface, nearest_partners
+from stitch.plugins.cells.job_files import POSE_COLUMNS, poses_from_columns, read_columns, write_poses
 from stitch.plugins.cells.placed_scans import join_scans
 from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
 from stitch.plugins.cells.seam import Limits, Station, bond_gap, find_edge, measure_seam
@@ -228,6 +230,30 @@ def test_path_follows_the_part():
     nominal, found, tool = truth(1), truth(2), truth(3)[None]
     moved = correct_path(tool, nominal, found)[0]
     assert np.allclose(np.linalg.inv(found) @ moved, np.linalg.inv(nominal) @ tool[0])
+
+
+def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it_is_lost(tmp_path, monkeypatch, capsys):
+    """The scanner's poses are moved in place of the part: 3 mm and 2 mrad a step, then 300 mm at once."""
+    columns = read_columns(EXAMPLE / "pane.csv", "file", POSE_COLUMNS)
+    files = [str(EXAMPLE / name) for name in columns.texts["file"]]
+    step = frames.exp(np.array([0.0, 0.002, 0.0, 2.0, -1.0, 2.0]))
+    centre = frames.make(np.eye(3), [3567.7, -2954.3, 1932.9])
+    moved = [centre @ np.linalg.matrix_power(step, k) @ frames.inverse(centre) for k in range(4)]
+    moved[3] = frames.make(np.eye(3), [300.0, 0, 0])
+    tables = [tmp_path / f"{k}.csv" for k in range(4)]
+    for table, T in zip(tables, moved, strict=True):
+        write_poses(table, "file", files, T @ poses_from_columns(columns))
+    monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{table}\n" for table in tables)))
+    with pytest.raises(SystemExit, match="0"):
+        main(["fit", str(EXAMPLE / "fit.toml"), "--follow"])
+    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    first = np.array(answers[0]["T_base_part"])
+    for answer, T in zip(answers[1:3], moved[1:3], strict=True):
+        assert np.abs(np.array(answer["T_base_part"]) - T @ first)[:3, 3].max() < 0.01
+        assert 0 < max(answer["sigma"]) < 0.01 < answer["latency_s"]
+        assert len(answer["path"]) == len(read_columns(EXAMPLE / "path.csv", "name", POSE_COLUMNS).texts["name"])
+    assert "lost" in answers[3]
+    assert "leave out the other outputs" in ended("fit", EXAMPLE / "fit.toml", "--follow", "--json", code=2).err
 
 
 @pytest.mark.parametrize(
