@@ -79,14 +79,14 @@ def require_no_change(
             change = _change_of(hypothesis, motions, later)
             if change is not None and _is_better(change[1].closed, as_it_stands.closed, len(motions.pairs)):
                 found.append((change[1].open, later, change, as_it_stands))
-    for _, later, (change, undone), as_it_stands in sorted(found, key=lambda one: one[0])[:_TRIED]:
+    for _, later, (step, undone), as_it_stands in sorted(found, key=lambda one: one[0])[:_TRIED]:
         across = [(v, w) for v, w in motions.pairs if later[v] != later[w]] or motions.pairs
         apart = _apart(capture, undone, across)
         stands = min(_apart(capture, fit, across) for fit in (as_it_stands, as_posed))
         if apart * CLEARLY_BETTER < stands:
             way = ways[int(undone.hypothesis.kind)]
             left = (undone.closed, apart), (as_it_stands.closed, stands)
-            told = _change_message([clouds[i] for i in kept], later, change, way.length_unit, left)
+            told = _change_message([clouds[i] for i in kept], later, step, way.length_unit, left)
             raise Refusal(told, *way.pairing.one_session_each(kept, len(clouds), later))
 
 
