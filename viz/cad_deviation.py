@@ -43,7 +43,8 @@ def cad_sentence(run: RunData) -> str:
     except NoResultError:
         return ""
     before, after = (_deviation(scans, cad, T_reference_part) for scans in (scans_before, scans_after))
-    better = "got better" if after < (1 - _SAME) * before else "got worse" if after > (1 + _SAME) * before else "is as before"
+    change = after / before - 1
+    better = "got worse" if change > _SAME else "got better" if change < -_SAME else "is the same"
     texts = [round_length(value, run.session.length_unit) for value in (before, after)]
     return f"Deviation from the CAD: {texts[0]} before, {texts[1]} with it (rms). The part {better}."
 
