@@ -495,28 +495,42 @@ def _as_reported(proposed: ProposedPose, session: SessionData) -> ProposedPose:
 
 
 def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) -> ProposedPose:
-    """Return the turned pose after which the information of all views, each like the others, leaves the least U."""
+    """Return the pose that would reduce the hand-eye's U most, of all poses taken, each turned about the part.
+
+    Every view is taken to show its pose alike well, so that poses alone say by which factor U changes.
+
+    Args:
+        live_fit: the views in the fit and their hand-eye.
+        views: those views, in the order of the fit.
+        hand_eye: the hand-eye so far, with its U at the part.
+    """
     capture = live_fit.capture
     gram = live_fit.unconstrained.overlaps.gram
     turns = [np.radians(angle) * axis for angle in _TURNS_DEG for axis in np.vstack([np.eye(3), -np.eye(3)])]
     about_part = [turn_about(turn, gram.centre) for turn in turns]
-    poses = np.array([T @ mount for mount in capture.T_reference_mount for T in about_part])
+    # One row for each view and turn: T_reference_mount.
+    turned = np.array([[T @ T_mount for T in about_part] for T_mount in capture.T_reference_mount])
+    poses = turned.reshape(-1, 4, 4)
     to_centre = frames.make(np.eye(3), -gram.centre)
-    taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
-    proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
+    # (·, 6, 6) left twist of a view about the centre per right perturbation of the hand-eye.
+    jacobians_taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
+    jacobians_proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
+    # Rotations count as the displacements that they make at the lever.
     unit = np.array([gram.lever] * 3 + [1.0] * 3)[:, None]
 
-    def uncertainty(jacobians: Array) -> float:
-        """U up to a factor; what all views have in common shows nothing."""
+    def relative_uncertainty(jacobians: Array) -> float:
+        """Return U at the part, up to a factor, from views (V, 6, 6); what moves all views alike shows nothing."""
         apart = unit * (jacobians - jacobians.mean(axis=0))
         information = np.einsum("vki,vkj->ij", apart, apart)
         # What no view shows yet is far from known, not known without error.
         weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
         return displacement(np.linalg.inv(information + weak), hand_eye.middle)
 
-    after = [uncertainty(np.concatenate([taken, J[None]])) for J in proposed]
-    best = int(np.argmin(after))
+    with_pose = [relative_uncertainty(np.concatenate([jacobians_taken, J[None]])) for J in jacobians_proposed]
+    best = int(np.argmin(with_pose))
     view = views[best // len(turns)]
-    T = poses[best] if hand_eye.frame == "flange" else frames.inverse(poses[best])
-    moved = Rotation.from_matrix(T[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
-    return ProposedPose(T, view.name, moved, hand_eye.U.mm * after[best] / uncertainty(taken))
+    # A fixed scanner sees the part on the flange: the reference is the flange then, and the mount the base.
+    T_base_flange = poses[best] if hand_eye.frame == "flange" else frames.inverse(poses[best])
+    turn_deg = Rotation.from_matrix(T_base_flange[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
+    U_mm = hand_eye.U.mm * with_pose[best] / relative_uncertainty(jacobians_taken)
+    return ProposedPose(T_base_flange, view.name, turn_deg, U_mm)

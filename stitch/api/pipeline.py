@@ -485,46 +485,52 @@ def _assemble_run(
     keep: bool = False,
     notes: tuple[str, ...] = (),
 ) -> RunData:
-    """Return the result of one session of a rig, with its line in the history.
+    """Return the run of one session of a rig: its fit and screening put together, with the first step of its ledger.
 
     Args:
-        finished: the session registered and fused, and its noise floor.
-        keep: views that do not belong were fused all the same.
+        index: of the session in the rig.
+        fitted: hand-eye and effects of the whole rig.
+        start: the hand-eye before the correction, and where it is from.
+        finished: the session registered and fused, and the rms that perfect poses would leave, length_unit.
+        screening: which of its views belong, and what is to be doubted.
+        keep: views that do not belong were fused all the same: they are noted as kept, and none as left out.
+        notes: sentences on what the sessions share.
     """
     fit, noise_floor = finished
     model = fitted.model_of(index)
     left_out, kept = ((), screening.left_out) if keep else (screening.left_out, ())
-    of_views = view_notes(left_out, kept, screening.suspected)
-    of_fit = pipeline_for(session).notes(session, fitted, index, start)
+    notes_on_views = view_notes(left_out, kept, screening.suspected)
+    notes_on_fit = pipeline_for(session).notes(session, fitted, index, start)
+    # Scans of all sessions show the one hand-eye that they share; labelled points have one for each session.
+    captures = fitted.captures if session.has_clouds else [fitted.captures[index]]
     # Where several sessions share a hand-eye no joint has one place for all.
-    shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
-    joints = session.joints if len(shared) == 1 else None
+    joints = session.joints if len(captures) == 1 else None
     fit = replace(
         fit,
         targets=fitted.sessions[index].targets,
         outliers=fitted.sessions[index].outliers,
-        unobservable=unobservable(shared, model.T_mount, session.robot, joints),
+        unobservable=unobservable(captures, model.T_mount, session.robot, joints),
         # A hand-eye of another run is as well known as it was there.
-        unknown=() if start.source == REUSED else unknown_numbers(shared, model.T_mount),
-        notes=(*of_views, *of_fit, *session_notes(session), *notes),
+        unknown=() if start.source == REUSED else unknown_numbers(captures, model.T_mount),
+        notes=(*notes_on_views, *notes_on_fit, *session_notes(session), *notes),
         sigma_anywhere=None if start.source == REUSED else _sigma_anywhere(fitted, index),
     )
-    rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
+    residual_rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
     heldout_rms = fitted.heldout_rms(index)
     values = {term.name: {p.name: p.value for p in term.parameters} for term in model.terms}
-    step = LedgerStep(tuple(model.effects), rms, heldout_rms, noise_floor, model.T_mount, values)
+    first_step = LedgerStep(tuple(model.effects), residual_rms, heldout_rms, noise_floor, model.T_mount, values)
     return RunData(
         session=session,
         measurement=fitted.sessions[index].measurement,
         model=model,
         T_mount_coarse=start.T_mount,
         gate=float("nan") if fit.overlaps is None else fit.overlaps.gate,
-        residual_rms=rms,
+        residual_rms=residual_rms,
         heldout_rms=heldout_rms,
         noise_floor=noise_floor,
         source=fit,
         register_method=next((stage.method for stage in fit.stages if stage.method), ""),
-        ledger=(step,),
+        ledger=(first_step,),
         doubts=screening.doubts,
         left_out=left_out,
         links=screening.links,

@@ -106,14 +106,17 @@ class FittedHandEye(Value):
 def fitted_hand_eye(
     session: SessionData, capture: Capture, T_mount: Array, covariance: Array, *, unknown: tuple[str, ...]
 ) -> FittedHandEye:
-    """Return a hand-eye (4, 4) with its covariance (6, 6), for the place where the views of a capture see the part.
+    """Return a hand-eye with its covariance, whose U is that of a point where the views of a capture see the part.
 
     Args:
+        T_mount: (4, 4) T_base_scanner (eye_to_hand) or T_flange_scanner (eye_in_hand), length_unit.
+        covariance: (6, 6) of T_mount·exp(ξ), scanner frame, rotation first; rad and length_unit.
         unknown: of x, y, z, rx, ry, rz: what the views do not show.
     """
-    middle = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
+    # Mean over the views of the centroid of each, scanner frame.
+    part_centre = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
     frame = "base" if session.mount == "eye_to_hand" else "flange"
-    return FittedHandEye(T_mount, covariance, frame, session.length_unit, middle, unknown)
+    return FittedHandEye(T_mount, covariance, frame, session.length_unit, part_centre, unknown)
 
 
 @dataclass(frozen=True, eq=False)

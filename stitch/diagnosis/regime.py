@@ -24,30 +24,39 @@ class Regime:
     # Multiples of an effect's plausible sizes, with their shares: beside a prior of pose errors any size may be the
     # true one; without it labelled points and many views show sizes whatever their prior.
     scales: dict[float, float]
-    # So many numbers that the variances are known to as many degrees of freedom, and one scale is enough.
-    long_without_prior: bool
+    # No prior, and so many observations that the variances are known to as many degrees of freedom: the likeliest of
+    # the scales is enough.
+    one_scale_is_enough: bool
     # The free fit takes the variances of the fit with plausible sizes: they are the same, or many and slow.
     free_fit_keeps_variances: bool
-    least_quick_gain: float  # nats at the null's variances below which a form is not worth a fit of its own
-    forms_refitted: int  # forms of a candidate that are worth a fit of their own
+    # A form is one choice of an effect's parameters (`candidates.Form`); one that is likely at the variances of the
+    # null hypothesis is fitted with variances of its own.
+    least_quick_gain: float  # log Bayes factor at the null's variances below which a form is not worth that
+    forms_refitted: int  # of a candidate, at the most
 
 
 def regime_of(linear: LinearModel) -> Regime:
-    """Return how a session is diagnosed: the one switch between few views, many views and labelled points."""
+    """Return how a session is diagnosed: the one switch between few views, many views and labelled points.
+
+    Its switches are two: whether pose errors have a prior, as those of fewer than 100 views of scans do, and how many
+    reduced observations there are, which says how well variances are known and how long a fit takes.
+    """
     prior = linear.pose_errors is not None
-    numbers = linear.mixed.size
-    if prior and numbers > limits.LONG:
+    observations = linear.mixed.size
+    settled = observations > limits.SETTLED_VARIANCES
+    if prior and settled:
+        # With many variances beside many observations each fit takes long: the likeliest form alone.
         forms_refitted = 1
-    elif numbers > MANY_NUMBERS:
+    elif observations > MANY_NUMBERS:
         forms_refitted = limits.FORMS_REFITTED_WITH_MANY_NUMBERS
     else:
-        forms_refitted = limits.REFITTED_NUMBERS // numbers
+        forms_refitted = limits.REFITTED_NUMBERS // observations
     return Regime(
         prior=prior,
         many_views=linear.measurement.views.count >= MANY_VIEWS,
         scales=ANY_SIZE if prior else PLAUSIBLE,
-        long_without_prior=not prior and numbers > limits.LONG,
-        free_fit_keeps_variances=prior or numbers > limits.LONG,
+        one_scale_is_enough=settled and not prior,
+        free_fit_keeps_variances=settled or prior,
         least_quick_gain=limits.HOPELESS_GAIN_WITH_PRIOR if prior else limits.HOPELESS_GAIN,
         forms_refitted=forms_refitted,
     )

@@ -160,7 +160,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
     regime = regime_of(linear)
     scales = regime.scales
-    if regime.long_without_prior:
+    if regime.one_scale_is_enough:
         scales = {scale: scales[scale]}
     deviances = {scale: integrated.deviance}
     if len(scales) > 1:
@@ -185,7 +185,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     # The scatter along the columns of a form is known to fewer degrees of freedom than numbers are left, where views
     # tell several components apart; among very many numbers to as many.
     known: float = max(mixed.size - a - rank, 1)
-    if not regime.long_without_prior:
+    if not regime.one_scale_is_enough:
         white = linear.in_blocks(linear.residual(form.columns))
         known = max(linear.satterthwaite.degrees_of_freedom(white), 1.0)
     p_value = f_tail(square / max(rank, 1), max(rank, 1), known)

@@ -325,41 +325,49 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
 def laws_of_base(
     linear: LinearModel, dictionary: Dictionary, laws: Sequence[Ranked], effect: Score | None = None
 ) -> tuple[Ranked, ...]:
-    """Return laws of the base, each as likely as that of a joint among some laws that moves the views alike.
+    """Return laws of the base that explain the views as a joint's law among some laws does, each as likely as that one.
 
     Args:
-        effect: what the joint does; None: as each law was fitted.
+        dictionary: all laws that were tried.
+        laws: the ranked ones, of which those of joints are asked.
+        effect: the score of the joint's effect; None: as each law was fitted.
     """
-    alike = list[Ranked]()
+    of_base = list[Ranked]()
     for ranked in laws:
         law, scored = law_of(ranked), effect or ranked.score
         if law.place.joint is None or law.place.with_base:
             continue
-        if not base_does_alike(linear, scored.form.columns @ scored.values, law.shapes):
+        if not could_be_base(linear, scored.form.columns @ scored.values, law.shapes):
             continue
-        same = (law.driver.name, law.shape)
-        whole = (
-            x
-            for x in dictionary.laws
-            if x.place.with_base and x.place.kind in _BODIES and x.is_whole and (x.driver.name, x.shape) == same
-        )
-        for of_base in whole:
-            again = _fitted(linear, of_base, linear.null.variances, 1.0)[1]
-            alike.append(replace(ranked, score=again))
-    return tuple(alike)
+        follows = (law.driver.name, law.shape)
+        for other in dictionary.laws:
+            of_body = other.place.kind in _BODIES and other.place.with_base
+            if of_body and other.is_whole and (other.driver.name, other.shape) == follows:
+                base_score = _fitted(linear, other, linear.null.variances, 1.0)[1]
+                of_base.append(replace(ranked, score=base_score))
+    return tuple(of_base)
 
 
-def base_does_alike(linear: LinearModel, numbers: Array, shapes: Array) -> bool:
-    """Return whether a base that follows shapes (V, R) about fixed axes makes reduced observations (n,) as well.
+def could_be_base(linear: LinearModel, effect: Array, shapes: Array) -> bool:
+    """Return whether a base that moves about fixed axes, in the course of some shapes, would explain an effect as well.
 
-    Both are aliases then, and what it cannot make is too small beside the scatter for odds of 20 to 1.
+    It would where what the base leaves of the effect is small on two scales: beside the scatter, so that likelihoods
+    differ by less than 20 to 1, and beside the effect itself, so that the two are aliases in these views.
+
+    Args:
+        effect: (n,) reduced observations that the effect makes.
+        shapes: (V, R) courses over the views, whose sizes about the six axes are free.
     """
-    base = next(moved for name, _, moved in _bodies(linear) if "base" in name)
-    moved = (base[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(base), -1)
-    basis = column_space(linear.residual(linear.observation.from_twists(moved)))
-    white = linear.residual(numbers[:, None])[:, 0]
-    rest = float(np.sum((white - basis @ (basis.T @ white)) ** 2))
-    return rest < min(2 * limits.ODDS, (1 - limits.ALIAS_CORRELATION**2) * float(np.sum(white**2)))
+    # Where the scanner is carried, the base stands where the part does; where it is fixed, with the scanner.
+    bodies = [twists for _, _, twists in _bodies(linear)]
+    base = bodies[1] if linear.measurement.eye_to_hand else bodies[0]
+    twists = (base[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(base), -1)
+    basis = column_space(linear.residual(linear.observation.from_twists(twists)))
+    white = linear.residual(effect[:, None])[:, 0]
+    left_square = float(np.sum((white - basis @ (basis.T @ white)) ** 2))
+    alias_square = (1 - limits.ALIAS_CORRELATION**2) * float(np.sum(white**2))
+    # A log likelihood is half a sum of squares.
+    return left_square < min(2 * limits.ODDS, alias_square)
 
 
 def law_of(ranked: Ranked) -> Law:
@@ -453,8 +461,11 @@ def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
 
 
 def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
-    """Give what the reference carries and what stands at the far end of the arm: name, kind, and (V, 6, 6) twists of
-    the views per unit of its own about axes that are fixed in it."""
+    """Yield the two bodies at the ends of the arm, what the reference carries and what the arm's far end does.
+
+    Each as name, kind, and (V, 6, 6): left twists of the views about the observation's centre per unit of a twist of
+    the body, which is counted in its own frame; rotation first, rad and length_unit.
+    """
     measurement = linear.measurement
     to_centre = frames.make(np.eye(3), -linear.observation.centre)
     still = np.broadcast_to(np.eye(4), (measurement.views.count, 4, 4))

@@ -38,9 +38,8 @@ SEEN_SIGMAS = 0.5
 FREE_SIZES = 30.0
 # Forms so many nats behind the best one of their candidate add less than a per cent to it (e^-6 = 0.0025).
 NEGLIGIBLE_NATS = 6.0
-# Numbers of reduced observations beyond which variances are the same under both priors of sizes, and a fit takes half
-# a second.
-LONG = 250
+# Reduced observations beyond which variances are the same under both priors of sizes, and a fit takes half a second.
+SETTLED_VARIANCES = 250
 # Nats: forms that lose so many under the null's variances do not gain under their own either; under several variances,
 # of which one is nearly that of the maximum, they gain half a nat at the most.
 HOPELESS_GAIN, HOPELESS_GAIN_WITH_PRIOR = -4.0, -1.5

@@ -31,7 +31,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.smooth_processes import SmoothProcess, leading_trends, size_process
-from stitch.diagnosis.systematic_laws import base_does_alike
+from stitch.diagnosis.systematic_laws import could_be_base
 from stitch.effects.contract import EFFECTS
 from stitch.model.model import term_of
 from stitch.numerics import parameter_selection
@@ -115,8 +115,8 @@ class JointEffect:
         turned = self.model.reduce((motions * error[:, None]).reshape(-1, 1))[:, 0]
         joint = f"joint {self.joint}"
         in_time = self.follows in (WITH_TIME, TIME_ONLY)
-        alike = in_time and base_does_alike(self.model, turned, error[:, None])
-        return f"{joint}, or the base about the same axis (these views cannot tell)" if alike else joint
+        or_base = in_time and could_be_base(self.model, turned, error[:, None])
+        return f"{joint}, or the base about the same axis (these views cannot tell)" if or_base else joint
 
     @cached_property
     def model(self) -> LinearModel:

@@ -351,23 +351,28 @@ def _stack_blocks(blocks: Sequence[Array]) -> Array:
 
 
 def _stack_mixed_models(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
-    """Mixed models of sessions that scatter alike, with columns A (ΣB, m, a) of the free mean of all."""
+    """Return the mixed models of sessions that scatter alike as one, with columns A (ΣB, m, a) of the free mean of all.
+
+    Blocks are padded to the m rows of the largest.
+    """
     if len(mixed) == 1:
         return mixed[0]
     m = max(model.z.shape[1] for model in mixed)
 
-    def wide(matrices: Array, absent: float = 0.0) -> Array:
-        lacking = m - matrices.shape[-1]
-        out = np.pad(matrices, [*[(0, 0)] * (matrices.ndim - 2), (0, lacking), (0, lacking)])
-        more = np.arange(m - lacking, m)
-        out[..., more, more] = absent
+    def padded(matrices: Array, added_variance: float = 0.0) -> Array:
+        """Return covariances (…, k, k) as (…, m, m); rows that are added have this variance, and no covariance."""
+        added = m - matrices.shape[-1]
+        out = np.pad(matrices, [*[(0, 0)] * (matrices.ndim - 2), (0, added), (0, added)])
+        diagonal = np.arange(m - added, m)
+        out[..., diagonal, diagonal] = added_variance
         return out
 
     fixed = [np.zeros((*o.z.shape, o.z.shape[1])) if o.fixed is None else o.fixed for o in mixed]
     return MixedModel(
         z=_stack_blocks([model.z for model in mixed]),
         A=A,
-        components=np.concatenate([wide(model.components) for model in mixed], axis=1),
-        fixed=np.concatenate([wide(matrices, absent=1.0) for matrices in fixed]),
+        components=np.concatenate([padded(model.components) for model in mixed], axis=1),
+        # Rows that a session lacks: zeros of unit variance, which take part in nothing.
+        fixed=np.concatenate([padded(matrices, added_variance=1.0) for matrices in fixed]),
         independent=sum(model.size for model in mixed),
     )

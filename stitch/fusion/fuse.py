@@ -217,12 +217,15 @@ def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
 
 @dataclass(frozen=True)
 class _Slabs:
-    """Slabs of the grid of cells in the reference frame."""
+    """Slabs of the grid of cells, across one axis of the frame of the registered poses: its cells are fused together.
+
+    A block is a cube of cells for which one point in memory is looked up.
+    """
 
     cell: float  # edge of a cell
     block: int  # cells along an edge of a block
     axis: int  # across the slabs
-    ends: Array  # (S + 1,) number of the first cell of each, and of the one after the last
+    ends: Array  # (S + 1,) along the axis: number of the first cell of each slab, and of the one after the last; ±inf
 
     @property
     def count(self) -> int:
@@ -239,20 +242,32 @@ class _Slabs:
 
 
 def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
-    """Slabs of so many points across the part's longest axis, which end where blocks end."""
-    step = block * cell
-    shown = [frames.transform(T, scan.points) for scan, T in zip(registered.own.scans, registered.poses, strict=True)]
-    low = np.min([points.min(axis=0) for points in shown], axis=0)
-    high = np.max([points.max(axis=0) for points in shown], axis=0)
+    """Return slabs across the part's longest axis, each with about `slab` of the points that were scanned.
+
+    They consist of whole layers, one block thick, so that no block lies in two slabs. How many points a layer has is
+    told from those in memory, each of which stands for as many of its view as were scanned.
+
+    Args:
+        cell: edge of a cell, length_unit.
+        block: cells along an edge of a block.
+        slab: points of a slab.
+    """
+    thickness = block * cell
+    clouds = [frames.transform(T, scan.points) for scan, T in zip(registered.own.scans, registered.poses, strict=True)]
+    low = np.min([points.min(axis=0) for points in clouds], axis=0)
+    high = np.max([points.max(axis=0) for points in clouds], axis=0)
     axis = int(np.argmax(high - low))
-    first = np.floor(low[axis] / step)
-    share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
-    length = int(np.floor(high[axis] / step) - first) + 1
-    along = np.zeros(length)
-    for points, per_point in zip(shown, share, strict=True):
-        along += per_point * np.bincount((np.floor(points[:, axis] / step) - first).astype(np.int64), minlength=length)
-    number = np.floor((np.cumsum(along) - along / 2) / slab)
-    ends = first + np.flatnonzero(np.diff(number) > 0) + 1
+    first = np.floor(low[axis] / thickness)
+    scanned = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
+    layers = int(np.floor(high[axis] / thickness) - first) + 1
+    count = np.zeros(layers)
+    for points, per_point in zip(clouds, scanned, strict=True):
+        layer = (np.floor(points[:, axis] / thickness) - first).astype(np.int64)
+        count += per_point * np.bincount(layer, minlength=layers)
+    # A layer belongs to the slab into which the middle one of its points falls, as they are counted from below.
+    slab_of_layer = np.floor((np.cumsum(count) - count / 2) / slab)
+    ends = first + np.flatnonzero(np.diff(slab_of_layer) > 0) + 1
+    # The outer slabs have no end: points that are not in memory may lie beyond those that are.
     return _Slabs(cell, block, axis, np.array([-np.inf, *(block * ends), np.inf]))
 
 

@@ -104,11 +104,14 @@ class Rows(ABC):
 
     @property
     def independent(self) -> int:
-        """How many numbers err independently.
+        """Return how many numbers err independently: from these the unknowns of a fit are subtracted.
 
-        A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
+        The pose of a view errs in six ways, however many rows it shows: it counts six, or its rows where they are
+        fewer. What a view shows beyond its pose goes into the U unknowns of the landmarks, which are counted here, as
+        they are subtracted later; but for the six motions of all landmarks as one, which are motions of the views too.
         """
-        return int(np.minimum(self.used.sum(axis=1), 6).sum()) + max(self.landmarks.shape[2] - 6, 0)
+        rows_of_poses = np.minimum(self.used.sum(axis=1), 6).sum()
+        return int(rows_of_poses) + max(self.landmarks.shape[2] - 6, 0)
 
     @cached_property
     def scattered(self) -> tuple[Array, Array]:

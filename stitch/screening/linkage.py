@@ -50,7 +50,7 @@ class Linkage:
 
     views: int
     components: tuple[tuple[int, ...], ...]
-    single: tuple[tuple[int, int], ...]  # (view, partner): held by this one pair alone
+    only_links: tuple[tuple[int, int], ...]  # (view, partner) of views that no other pair holds
 
     @property
     def core(self) -> tuple[int, ...]:
@@ -91,10 +91,10 @@ def linkage_of_pairs(views: int, pairs: Sequence[tuple[int, int]]) -> Linkage:
     near = np.zeros((views, views), bool)
     for v, w in pairs:
         near[v, w] = near[w, v] = True
-    single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
+    only_links = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
     count, label = connected_components(coo_array(near), directed=False)
     parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]
-    return Linkage(views, tuple(sorted(parts, key=lambda part: (-len(part), part))), tuple(single))
+    return Linkage(views, tuple(sorted(parts, key=lambda part: (-len(part), part))), tuple(only_links))
 
 
 def find_contradicting_views(

@@ -30,7 +30,7 @@ from stitch.session.session import SessionData
 
 # A hand-eye that differs by chance alone is refused once in a million.
 _HAND_EYE_CHANCE = 1e-6
-# That something which holds is doubted: half for the hand-eye, half for all targets.
+# That a model which holds is doubted: half of it for the hand-eye, half for all targets (Bonferroni).
 _MODEL_CHANCE = 0.01
 # Targets that a message lists.
 _LISTED = 4
@@ -86,7 +86,15 @@ def check_model_transfer(
 
 
 def _transfer_warnings(session: SessionData, applied: FittedSession, fitted: FittedSession | None) -> tuple[str, ...]:
-    """Return warnings; none where the other run holds."""
+    """Return what to doubt of the other run's model in one session; () where it holds.
+
+    Args:
+        applied: the session under that model.
+        fitted: with hand-eye and targets fitted here; None where no such fit came to an end.
+
+    Raises:
+        NoResultError: no arm errs by as much as that model leaves.
+    """
     there = applied.targets
     assert there is not None
     beyond = beyond_any_arm(session, *np.sqrt(there.variances[:2]))
@@ -104,18 +112,27 @@ def _transfer_warnings(session: SessionData, applied: FittedSession, fitted: Fit
 
 
 def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) -> str | None:
-    """Return what lies elsewhere than in the other run, and what to do; None where what is fitted here leaves no less
-    than chance would."""
+    """Return a sentence on what lies elsewhere than in the other run, the hand-eye or targets, and what to do.
+
+    None where a fit of both here leaves no less than chance would, or neither has moved beyond what both runs know it
+    to.
+
+    Args:
+        there: the views of this session under the model of the other run.
+        here: the same views with hand-eye and targets fitted to them.
+        unit: of length.
+    """
     if not significantly_smaller(here.view_squares, there.view_squares, _MODEL_CHANCE):
         return None
-    apart = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)
-    distance = mahalanobis_square(apart, there.model.covariance + here.model.covariance)
-    parts = []
-    if chi2_tail(distance, 6) < _MODEL_CHANCE / 2:
-        turned = 1e3 * float(np.linalg.norm(apart[:3]))
-        moved = length_text(float(np.linalg.norm(apart[3:])), unit)
-        parts.append(
-            f"the hand-eye of the other run does not hold here: fitted here it lies {moved} and {turned:.3g} mrad from "
+    # Right perturbation (6,) from the hand-eye there to the one here, scanner frame, as their covariances count it.
+    xi = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)
+    square = mahalanobis_square(xi, there.model.covariance + here.model.covariance)
+    moved = []
+    if chi2_tail(square, 6) < _MODEL_CHANCE / 2:
+        mrad = 1e3 * float(np.linalg.norm(xi[:3]))
+        shift = length_text(float(np.linalg.norm(xi[3:])), unit)
+        moved.append(
+            f"the hand-eye of the other run does not hold here: fitted here it lies {shift} and {mrad:.3g} mrad from "
             "there"
         )
     displaced = _displaced_targets(there, here)
@@ -124,16 +141,19 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
         lie = "lie" if len(displaced) > 1 else "lies"
         farthest = length_text(max(displaced.values()), unit)
         names = ", ".join([*displaced][:_LISTED])
-        parts.append(f"{names}{more} {lie} elsewhere than in the other run, by up to {farthest}")
-    if not parts:
+        moved.append(f"{names}{more} {lie} elsewhere than in the other run, by up to {farthest}")
+    if not moved:
         return None
-    off = length_text(_rms(there.view_squares), unit)
-    fitted = length_text(_rms(here.view_squares), unit)
-    return sentence("model does not hold", what="; ".join(parts), off=off, fitted=fitted)
+    rms_there = length_text(_rms(there.view_squares), unit)
+    rms_here = length_text(_rms(here.view_squares), unit)
+    return sentence("model does not hold", what="; ".join(moved), off=rms_there, fitted=rms_here)
 
 
 def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str, float]:
-    """Return how far the targets that lie elsewhere are from where the other run has them, by their names."""
+    """Return by name how far (length_unit) targets are from where the other run has them, of those that have moved.
+
+    They have where chance does not explain it: half of `_MODEL_CHANCE` is shared by all targets.
+    """
     sigmas = here.landmark_sigmas
     known = {name: k for k, name in enumerate(here.rows.sightings.targets) if name in there.model.targets}
     displaced = dict[str, float]()

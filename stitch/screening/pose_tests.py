@@ -110,16 +110,16 @@ class BlunderSearch:
     mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
     null_projector: Projector  # null hypothesis with those columns in it
     unplaced: Sequence[int] = ()  # views that nothing holds
-    displaced: Sequence[int] = ()  # views that were placed by their surfaces, and stand off whatever others scatter
+    # Views that overlapped no other, were placed by their surfaces, and are off by more than the others scatter.
+    unlinked_blunders: Sequence[int] = ()
     steps: tuple[PoseStep, ...] = ()
-    sure: frozenset[int] = (
-        frozenset()
-    )  # displaced views that effects of the arm do not explain in sizes that others show
+    # Of these, those that effects of the arm do not explain either, in sizes that the other views show.
+    beyond_effects: frozenset[int] = frozenset()
 
     @property
     def excluded(self) -> list[int]:
         """Views that take no part in the tests of the others."""
-        return [*self.unplaced, *self.displaced]
+        return [*self.unplaced, *self.unlinked_blunders]
 
     @property
     def standing_off(self) -> list[int]:
@@ -130,41 +130,53 @@ class BlunderSearch:
 def pose_tests(
     model: ViewModel,
     unconstrained: UnconstrainedPoses,
-    unlinked: tuple[list[int], list[int]],
+    unplaced: list[int],
+    placed: list[int],
     usual: UsualEffects | None,
     chance: float = STEP_CHANCE,
 ) -> BlunderSearch:
-    """Find single views that are off and steps; where there is a step, single views once more beside it.
+    """Return single views that are off, and steps, which all views from one on share.
+
+    Views that overlap no other are tested by themselves first, and the rest beside those of them that are off. Steps
+    are sought beside single views, each of which may look like one; where there is a step, single views are sought once
+    more beside it, since a view at the step may have stood for one of its sides.
 
     Args:
-        unlinked: views that nothing holds, and those that were placed by their surfaces.
-        usual: what may happen to views beside white scatter; in many views it takes minutes to test a step against it.
+        model: the evidence about the views' poses.
+        unconstrained: the views where their surfaces put them.
+        unplaced: views that no surface holds: they stay free.
+        placed: views that overlapped no other, and were placed by their surfaces.
+        usual: effects by which poses may err beside white scatter; in many views it takes minutes to test against them.
         chance: that a session without a step shows one.
     """
-    unplaced, placed = unlinked
-    off = _find_unlinked_blunders(model, unplaced, placed)
-    search = find_blunders(model, [*unplaced, *off])
-    erring = model
+    unlinked_blunders = _find_unlinked_blunders(model, unplaced, placed)
+    search = find_blunders(model, [*unplaced, *unlinked_blunders])
+    model_with_effects = model
     if usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS:
-        erring = model.with_errors(usual.errors(unconstrained))
-    singles = search.mean_columns, len(off) + len(search.blunders)
-    steps = find_steps(erring, model.columns(unplaced), singles, chance)
+        model_with_effects = model.with_errors(usual.errors(unconstrained))
+    singles = search.mean_columns, len(unlinked_blunders) + len(search.blunders)
+    steps = find_steps(model_with_effects, model.columns(unplaced), singles, chance)
     if steps:
-        # A view at the step may stand for one of its sides.
-        off = _find_unlinked_blunders(model, unplaced, placed, steps)
-        search = find_blunders(model, [*unplaced, *off], steps)
-    sure = _find_unlinked_blunders(erring, unplaced, off, steps)
-    return replace(search, unplaced=unplaced, displaced=off, steps=steps, sure=frozenset(sure))
+        unlinked_blunders = _find_unlinked_blunders(model, unplaced, placed, steps)
+        search = find_blunders(model, [*unplaced, *unlinked_blunders], steps)
+    # Without effects white scatter is all that may happen, and every blunder is beyond it.
+    beyond_effects = frozenset(_find_unlinked_blunders(model_with_effects, unplaced, unlinked_blunders, steps))
+    search = replace(search, unplaced=unplaced, unlinked_blunders=unlinked_blunders)
+    return replace(search, steps=steps, beyond_effects=beyond_effects)
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
-    """Find blunders among the views of a model.
+    """Return the blunders among the views of a model, by the generalised extreme Studentised deviate (Rosner 1983).
+
+    The worst view is let go, and the next is sought under the scatter of the rest; the largest count whose last view is
+    significant holds, so that several do not hide in the scatter which they inflate.
 
     Args:
         excluded: views that are known to be off: they stay free and are not counted.
         steps: what all views from one on have in common.
     """
     freed = list[int]()
+    # One more than views are freed: what is left after each number of them.
     states = list[tuple[VarianceFit, Array | None, Projector]]()
     columns = _free_view_columns(model, excluded, steps)
     most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
@@ -202,7 +214,7 @@ def _find_unlinked_blunders(
 
 
 def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
-    """(n, K) of views that stay free, and of steps."""
+    """Return columns (n, K) of views that stay free, and of steps; None without any."""
     if not len(excluded) and not steps:
         return None
     return hstack_columns(model.columns(excluded), *(step.columns(model) for step in steps))
@@ -211,19 +223,20 @@ def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequenc
 def find_steps(
     model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
 ) -> tuple[PoseStep, ...]:
-    """Find change points in the order of time, beside single views that are off.
+    """Return the steps, first to last, that explain the views better than single views that are off do.
 
     Args:
-        model: with all that may happen without a step.
+        model: its scatter holds all that may happen without a step.
         first: (n, K) columns of views that are known to be off.
         singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
         chance: that a session without a step shows one.
     """
+    single_columns, single_count = singles
     steps, columns = _search_steps(model, first, chance)
-    if singles[1]:
-        beside_them, every = _search_steps(model, singles[0], chance)
-        if not steps or _akaike_criterion(model, every) < _akaike_criterion(model, columns):
-            steps = beside_them
+    if single_count:
+        steps_beside_singles, all_columns = _search_steps(model, single_columns, chance)
+        if not steps or _akaike_criterion(model, all_columns) < _akaike_criterion(model, columns):
+            steps = steps_beside_singles
     return tuple(sorted(steps, key=lambda step: step.start))
 
 
@@ -238,7 +251,8 @@ class _Pick:
 
 
 def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
-    """Find steps on top of columns that are in the mean already; return all columns with them and with single views.
+    """Return the steps found on top of columns (n, K) that are in the mean already, and all columns with them and with
+    the single views picked beside them.
 
     As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
     back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
@@ -333,10 +347,13 @@ def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody
 
 
 def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
-    """Return Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
+    """Return Akaike's criterion for few observations (Hurvich and Tsai 1989), inf where parameters use them up.
+
+    It is needed, since half of the views, let go, would leave no scatter.
+    """
     count = len(model.z)
-    taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
-    return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
+    fitted = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
+    return model.deviance(columns) + 2 * fitted * count / (count - fitted - 1) if count > fitted + 1 else np.inf
 
 
 def expected_poses(
@@ -376,12 +393,14 @@ def expected_poses(
 def least_displacement(
     model: ViewModel, search: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
 ) -> DisplacementSize:
-    """Return the smallest displacement of a view's middle that its evidence admits.
+    """Return the smallest rotation (rad) and shift (length_unit) of a view that its evidence admits.
 
     Args:
         search: the scatter of the poses.
         others: views that are off beside this one: they stay free.
-        middle: (3,) of the view's points, reference frame.
+        steps: what all views from one on share: they stay free too.
+        view: the one that is asked.
+        middle: (3,) centroid of its points, whose shift counts, reference frame.
     """
     under = projector(model, search.fit, _free_view_columns(model, others, steps))
     carried = np.eye(6)

@@ -131,7 +131,10 @@ def snoop_views(
     unconstrained: UnconstrainedPoses | None = None,
     usual: UsualEffects | None = None,
 ) -> Snooping:
-    """Examine the views of a capture under a hand-eye.
+    """Return which views of a capture do not belong, and what all from one view on share, under a hand-eye.
+
+    Views are placed by their surfaces, and the pose of each is tested against where the robot has it; those that stand
+    out are misplaced if usual effects of an arm do not explain them, and suspected else.
 
     Args:
         T_mount: (4, 4) corrected hand-eye.
@@ -150,25 +153,25 @@ def snoop_views(
     located = place_views(capture, *_place_across_steps(capture, T_mount, unconstrained, usual))
     located = replace(located, unconstrained=located.unconstrained.relative_to(model_poses))
     model = view_model(capture, T_mount, located.unconstrained)
-    tests = pose_tests(model, located.unconstrained, (located.unplaced, list(located.placed)), usual)
+    tests = pose_tests(model, located.unconstrained, located.unplaced, list(located.placed), usual)
     expected = expected_poses(model, model_poses, located.unconstrained, tests) if tests.steps else model_poses
     standing_out = _displaced_views(capture, model, expected, located, tests)
     # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
     torn = {v for v in located.torn if v not in located.unplaced}
-    sure = {m.view for m in standing_out}
-    if sure and usual is not None:
+    misplaced_views = {m.view for m in standing_out}
+    if misplaced_views and usual is not None:
         # Those that stand out beside what usually happens to all of them too.
         with_usual = model.with_usual(usual.twists(located.unconstrained))
         again = find_blunders(with_usual, tests.excluded, tests.steps)
-        sure &= set(again.blunders) | tests.sure | torn
-    silent = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
-    groups = linkage(located.unconstrained.overlaps, silent).components
+        misplaced_views &= set(again.blunders) | tests.beyond_effects | torn
+    holding_nothing = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
+    groups = linkage(located.unconstrained.overlaps, holding_nothing).components
     foreign = [
         MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, None)
         for v in located.unplaced
         if (v,) in groups
     ]
-    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
+    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in misplaced_views]
     few = None
     accused = misplaced or foreign or tests.steps or tests.null_projector.degrees < 1
     if usual is not None and _FEWEST <= model.count <= FEW_VIEWS and not accused:
@@ -176,7 +179,7 @@ def snoop_views(
     return Snooping(
         **vars(located),
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
-        suspected=tuple(m for m in standing_out if m.view not in sure),
+        suspected=tuple(m for m in standing_out if m.view not in misplaced_views),
         steps=tests.steps,
         disconnected=tuple(group for group in groups if not set(group) <= {m.view for m in foreign}),
         model=model,
@@ -206,7 +209,7 @@ def _place_across_steps(
     if not unlinked:
         return model_poses, unconstrained
     model = view_model(capture, T_mount, unconstrained)
-    tests = pose_tests(model, unconstrained, (unlinked, []), usual, _ANY_CHANCE)
+    tests = pose_tests(model, unconstrained, unlinked, [], usual, _ANY_CHANCE)
     if not tests.steps:
         return model_poses, unconstrained
     expected = expected_poses(model, model_poses, unconstrained, tests)
@@ -218,7 +221,11 @@ def _place_across_steps(
 
 
 def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
-    """Find where views belong by their surfaces: those that nothing links are tried wide.
+    """Return where views belong by their surfaces: those that nothing links are tried wide.
+
+    First views that contradict the others are set apart, since they would link what does not belong together; then
+    those that are not linked are placed one by one; then, where several were, all by one displacement. Where that
+    changes poses, overlaps are matched anew, and the contradictions asked again.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
@@ -229,15 +236,15 @@ def place_views(capture: Capture, model_poses: Array, unconstrained: Unconstrain
     size = part_size([capture])
     groups = linkage(unconstrained.overlaps, lines).components
     torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
-    linked = linkage(unconstrained.overlaps, {*lines, *torn})
-    needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
-    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
-    if placed and len(linked.unlinked) > 1:
+    links = linkage(unconstrained.overlaps, {*lines, *torn})
+    needed = needed_closure(capture, unconstrained.poses, links, tolerance)
+    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, links, (tolerance, needed))
+    if placed and len(links.unlinked) > 1:
         # One displacement of all explains more than one of each, which may have closed in a wrong place.
-        together = _place_together(capture, model_poses, unconstrained, placed, linked.unlinked, tolerance)
+        together = _place_together(capture, model_poses, unconstrained, placed, links.unlinked, tolerance)
         if together is not None:
             unconstrained = together
-            linked = linkage(together.overlaps, lines)
+            links = linkage(together.overlaps, lines)
             torn, placed, unplaced, several = (), {}, [], set()
     if placed:
         poses = np.array(unconstrained.poses)
@@ -247,7 +254,7 @@ def place_views(capture: Capture, model_poses: Array, unconstrained: Unconstrain
         if torn:
             still = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, STILL_CONTRADICTS)
             torn = tuple(v for v in still if v in torn)
-    return PlacedViews(unconstrained, linked, placed, unplaced, several, torn, lines, tolerance, needed)
+    return PlacedViews(unconstrained, links, placed, unplaced, several, torn, lines, tolerance, needed)
 
 
 def _place_together(
@@ -297,25 +304,32 @@ def end_runs(views: Collection[int], count: int) -> list[range]:
 def _displaced_views(
     capture: Capture, model: ViewModel, expected: Array, located: PlacedViews, tests: BlunderSearch
 ) -> list[MisplacedView]:
-    """Return views that stand off and torn ones, with where the surface of the others puts them."""
+    """Return views that stand off and torn ones, with where the surface of the others puts them.
+
+    Args:
+        expected: (V, 4, 4) T_reference_scanner by the robot, steps with it: displacements are counted from there.
+    """
     unconstrained = located.unconstrained
-    off = sorted((*tests.displaced, *tests.blunders))
-    places = {v: _refine_pose(capture, unconstrained, v, located.tolerance) for v in off}
-    places |= {v: unconstrained.poses[v] for v in located.torn if v not in {*off, *located.unplaced}}
+    blunders = sorted((*tests.unlinked_blunders, *tests.blunders))
+    surface_poses = {v: _refine_pose(capture, unconstrained, v, located.tolerance) for v in blunders}
+    surface_poses |= {v: unconstrained.poses[v] for v in located.torn if v not in {*blunders, *located.unplaced}}
     displaced = []
-    for v, T in places.items():
-        middle = capture.scans[v].points.mean(axis=0)[None]
-        there = frames.transform(unconstrained.poses[v], middle)[0]
+    for v, T in surface_poses.items():
+        centroid = capture.scans[v].points.mean(axis=0)[None]
+        centroid_in_reference = frames.transform(unconstrained.poses[v], centroid)[0]
         others = [w for w in tests.standing_off if w != v]
-        least = least_displacement(model, tests, others, tests.steps, v, there)
+        least = least_displacement(model, tests, others, tests.steps, v, centroid_in_reference)
         turn = float(frames.angle_between(expected[v], T))
-        shift = float(np.linalg.norm(frames.transform(T, middle) - frames.transform(expected[v], middle)))
+        shift = float(np.linalg.norm(frames.transform(T, centroid) - frames.transform(expected[v], centroid)))
         displaced.append(MisplacedView(v, "displaced", turn, shift, T, least))
     return displaced
 
 
 def _refine_pose(capture: Capture, unconstrained: UnconstrainedPoses, view: int, tolerance: float) -> Array:
-    """(4, 4) where the surface of the other views puts one: robust weights of all pairs hold it back."""
+    """Return T_reference_scanner (4, 4) where the surface of the other views puts one, if that closes better.
+
+    Fitted with all others at once, robust weights hold a view back at its old place.
+    """
     scan = capture.scans[view]
     T = unconstrained.poses[view]
     others = [v for v in range(len(capture.scans)) if v != view]

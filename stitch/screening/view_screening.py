@@ -135,13 +135,14 @@ def _fit_and_screen(
     measurements: Sequence[Measurement],
     fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
 ) -> tuple[FittedRig, list[ViewScreening]]:
+    """Return the fit of a rig, and per session what may be fused under it."""
     fitted = fit(sessions, measurements)
     return fitted, [_screen_session(session, fitted, i) for i, session in enumerate(sessions)]
 
 
 @contextmanager
 def _naming_excluded_views(sessions: Sequence[SessionData], taken: Sequence[ViewScreening]) -> Iterator[None]:
-    """Where the views that are left lead nowhere, say which were left out before, and why."""
+    """Append to a NoResultError of the block which views were left out before, and why; `taken` by session."""
     try:
         yield
     except NoResultError as error:
@@ -152,6 +153,7 @@ def _naming_excluded_views(sessions: Sequence[SessionData], taken: Sequence[View
 
 
 def _screen_session(session: SessionData, fitted: FittedRig, index: int) -> ViewScreening:
+    """Return what may be fused of session `index` of a rig: by its scans, or else by its labelled points."""
     if fitted.correction is not None:
         return screen_views(session, fitted.sessions[index].measurement, fitted.correction, index)
     targets = fitted.sessions[index].targets
@@ -160,9 +162,14 @@ def _screen_session(session: SessionData, fitted: FittedRig, index: int) -> View
 
 
 def screen_views(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
-    """Examine the views of one session of a rig under a corrected model.
+    """Return which views of one session of a rig may be fused under a corrected model, or refuse the session.
+
+    What concerns all views is asked before single ones, since it makes good views look wrong: a hand-eye of another
+    set-up, stock (returned alone: the caller takes it off and asks again), mistakes of the table of poses.
 
     Args:
+        measurement: of the session.
+        correction: hand-eye and views of the whole rig.
         index: of the session in the rig.
 
     Raises:
@@ -178,34 +185,34 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         return ViewScreening(stock=stock)
     if poses_contradict_scans(session, snooping):
         refuse_contradiction(session, snooping, given=correction.given)
-    lengths = length_problem(snooping.model, capture.T_reference_mount, snooping.blunder_search.mean_columns)
-    if lengths is not None:
-        # Other mistakes look like a factor on lengths too.
-        refuse(session, [lengths if found.kind == lengths.kind else found for found in deep_check(session)])
-        refuse(session, [lengths])
+    wrong_lengths = length_problem(snooping.model, capture.T_reference_mount, snooping.blunder_search.mean_columns)
+    if wrong_lengths is not None:
+        # Other mistakes look like a factor on lengths too: those are refused first, under their own names.
+        refuse(session, [wrong_lengths if p.kind == wrong_lengths.kind else p for p in deep_check(session)])
+        refuse(session, [wrong_lengths])
     if scatters_beyond_effects(session, snooping):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
+    # Before small steps are dropped: the warnings tell of them.
     warnings = snooping_warnings(session, capture, snooping, T_mount)
     if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
-        # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
+        # A slip of the part, or a knock of the mount, that effects can describe is left to the diagnosis: no view
+        # beyond it is left out.
         snooping = replace(snooping, steps=())
+    # Of few views the warnings weigh all poses together: no single one is suspected beside that.
+    suspected = snooping.suspected if snooping.few is None else ()
     names = session.names
     poses = capture.poses(T_mount)
     return ViewScreening(
         left_out=_misplaced_views(session, capture, T_mount, snooping),
-        suspected=tuple(
-            _excluded_view(session, m.view, suspicion_in_words(session, m), poses)
-            for m in snooping.suspected
-            if snooping.few is None
-        ),
+        suspected=tuple(_excluded_view(session, m.view, suspicion_in_words(session, m), poses) for m in suspected),
         links=ViewLinks(
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
-            weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
+            weak=tuple((names[v], names[w]) for v, w in snooping.linkage.only_links),
         ),
         doubts=(
             *target_warnings(session, capture.sightings),
-            *(found.fix for found in stock_problems(session, capture)),
+            *(problem.fix for problem in stock_problems(session, capture)),
             *_copies(session, capture, snooping),
             *warnings,
         ),
@@ -213,7 +220,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
 
 
 def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:
-    """Yield a warning of every two scans with the same numbers, of which neither is left out."""
+    """Yield a warning of every two scans with the same points, of which neither is left out."""
     kept = [v for v in range(len(capture.scans)) if v not in snooping.left_out]
     for v, w in combinations(kept, 2):
         if np.array_equal(capture.scans[v].points, capture.scans[w].points):
@@ -223,12 +230,18 @@ def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Itera
 def _misplaced_views(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> tuple[ExcludedView, ...]:
+    """Return the views that are left out, each with the reason.
+
+    Raises:
+        NoResultError: the views are groups that share no surface.
+    """
     problems = explain_misplaced(session, capture, T_mount, snooping) if snooping.left_out else []
-    apart = next((found for found in problems if found.mistake == "groups"), None)
+    apart = next((problem for problem in problems if problem.mistake == "groups"), None)
     if apart is not None:
         raise NoResultError(f"{session.path}: {apart.line(session.names)}")
     poses = capture.poses(T_mount)
-    why = {name: found.line(session.names) for found in reversed(problems) for name in found.views}
+    # A view with several problems has the reason of the first.
+    why = {name: problem.line(session.names) for problem in reversed(problems) for name in problem.views}
     return tuple(
         _excluded_view(session, v, why.get(session.names[v], sentence("alone")), poses) for v in snooping.left_out
     )
@@ -270,6 +283,7 @@ def session_warnings(
 
 
 def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:
+    """Return what the tests say of the views of session `index` of a rig, less what is no larger than arms repeat."""
     announce("checking every view against the others")
     snooping = snoop_views(
         correction.captures[index],

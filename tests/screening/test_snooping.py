@@ -116,12 +116,12 @@ def test_motions_between_scans_are_those_of_the_cell(cell):
 def test_a_chain_is_one_component_and_its_ends_hang_by_one_pair():
     found = linkage_of_pairs(5, [(0, 1), (1, 2), (2, 3), (3, 4)])
     assert found.components == ((0, 1, 2, 3, 4),)
-    assert found.single == ((0, 1), (4, 3))
+    assert found.only_links == ((0, 1), (4, 3))
 
 
 def test_in_a_ring_nothing_hangs_by_one_pair():
     found = linkage_of_pairs(6, [(v, (v + 1) % 6) for v in range(6)])
-    assert (found.single, found.unlinked) == ((), ())
+    assert (found.only_links, found.unlinked) == ((), ())
 
 
 def test_two_rings_are_two_groups():

@@ -27,7 +27,7 @@ COLOUR_STEPS = 10
 _USUAL_ARM, _PALE = 0.02, 4.0
 # Mean of |x| of a normal x of unit sigma.
 _MEAN_OF_NORMAL = float(np.sqrt(2 / np.pi))
-# Radii of the patches that are tried, as shares of the part's longest side.
+# Radii of the patches that are tried, the smallest first, as shares of the part's longest side.
 _RADII = (1 / 32, 1 / 24, 1 / 18, 1 / 13, 1 / 10)
 # A patch counts its correspondences in cells of this share of its radius; the cells' scatter is its standard error.
 _CELL = 0.4
@@ -100,28 +100,31 @@ def _mean_over_views(values: Array) -> Array:
 def patches_of(matches: Sequence[Match], views: int, scale: float, model_distances: Array) -> "Patches":
     """Return patches over the surface that the matches cover, as small as the noise allows.
 
+    The radius grows until the standard errors are below one step of the colours, whose range is what nearly all of the
+    field keeps; the largest radius is taken where they never are, the present one where no patch tells its error.
+
     Args:
         matches: of all overlapping pairs, with the views where they agree best: what scatters there is noise.
         views: their number V.
-        scale: robust sigma of the distances; what lies beyond the gate of the rms is an edge.
-        model_distances: (M,) distances under the model whose field the colours are to show.
+        scale: robust sigma of the distances, length_unit; what lies beyond the gate of the rms is an edge.
+        model_distances: (M,) distances under the model whose field the colours are to show, length_unit.
     """
     pairs = _Correspondences(matches, views, scale)
-    size = float(np.ptp(np.quantile(pairs.middle, [0.005, 0.995], axis=1), axis=0).max())
+    # Of all points but a hundredth: single ones far off would make the part longer.
+    longest_side = float(np.ptp(np.quantile(pairs.middle, [0.005, 0.995], axis=1), axis=0).max())
     for share in _RADII:
-        patches = Patches(pairs, share * size)
-        if (
-            not np.isfinite(patches.sigma).any()
-            or largest_standard_error(patches.sigma) <= patches.field(model_distances).quantile() / COLOUR_STEPS
-        ):
+        patches = Patches(pairs, share * longest_side)
+        colour_step = patches.field(model_distances).quantile() / COLOUR_STEPS
+        if not np.isfinite(patches.sigma).any() or largest_standard_error(patches.sigma) <= colour_step:
             break
     return patches
 
 
 class _Correspondences:
-    """The R correspondences of M whose distance is inside the robust gate."""
+    """The R correspondences of M whose distance is inside the robust gate, at the poses of the matches."""
 
     def __init__(self, matches: Sequence[Match], views: int, scale: float) -> None:
+        """Take matches of V `views` apart, in their order; `scale` is the robust sigma of their distances."""
         self.views = views
         self.distances = np.concatenate([m.residual for m in matches])  # (M,)
         self.inside: Mask = np.abs(self.distances) < RMS_GATE * scale  # (M,)
@@ -139,6 +142,7 @@ class Patches:
     """K patches of one radius on the part, and which correspondences belong to them, with which weight."""
 
     def __init__(self, pairs: _Correspondences, radius: float) -> None:
+        """Group the correspondences into C cells, these into K patches, and weigh each cell for each patch."""
         cell, centre, facing = _group_points(pairs.middle, pairs.normal, pairs.side, _CELL * radius)
         self._inside = pairs.inside
         self._cell_of = np.concatenate([cell, cell]) * pairs.views + pairs.view

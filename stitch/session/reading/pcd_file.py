@@ -27,6 +27,7 @@ def read_pcd(path: Path) -> dict[str, Array]:
     raw = path.read_bytes()
     header, encoding, start = _header(path, raw)
     layout, count = _binary_layout(path, header)
+    # By name, the field's number as text: so the layout calls it, since padding has one name for several fields.
     kept = {name: str(i) for i, name in enumerate(header["FIELDS"]) if not layout[i].shape and name != "_"}
     body = raw[start:]
     if encoding == "ascii":
@@ -78,6 +79,18 @@ def _binary_layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[n
 def _ascii_columns(
     path: Path, body: bytes, layout: np.dtype[np.void], count: int, kept: dict[str, str]
 ) -> dict[str, Array]:
+    """Return columns (N,) by field name of data that are text, a line for each point.
+
+    Args:
+        body: the file after its header.
+        layout: the fields of a point; one with a shape takes as many columns of text as it has values.
+        count: N, the points that the header announces.
+        kept: names of the fields to return, with their number in the layout.
+
+    Raises:
+        InputError: no points, or fewer than announced.
+    """
+    # A header may announce more than memory holds: the lines that are there limit what is made room for.
     rows = min(count, body.count(b"\n") + 1)
     if not body.strip():
         raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
@@ -85,14 +98,24 @@ def _ascii_columns(
     table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=rows).reshape(-1, sum(widths))
     if len(table) < count:
         raise InputError(_cut_short(path, count, len(table)))
-    first = np.concatenate([[0], np.cumsum(widths)])
-    return {name: table[:, first[int(field)]] for name, field in kept.items()}
+    first_columns = np.concatenate([[0], np.cumsum(widths)])
+    return {name: table[:, first_columns[int(field)]] for name, field in kept.items()}
 
 
 def _compressed_columns(
     path: Path, body: bytes, layout: np.dtype[np.void], count: int, kept: dict[str, str]
 ) -> dict[str, Array]:
-    """Of data that are LZF-compressed, and stored field by field."""
+    """Return columns (N,) by field name of data that are LZF-compressed, and stored field by field.
+
+    Args:
+        body: the file after its header: packed size, size, packed bytes.
+        layout: the fields of a point.
+        count: N, the points that the header announces.
+        kept: names of the fields to return, with their number in the layout.
+
+    Raises:
+        InputError: the bytes are fewer than announced, or unpack to another number of points.
+    """
     packed, size = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
     if size != layout.itemsize * count or len(body) < 8 + packed or size > _MOST_PACKED * packed:
         raise InputError(f"{path}: compressed data are cut short; export it again")
