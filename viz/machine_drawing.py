@@ -4,6 +4,7 @@ The arm is drawn from its own kinematics, seen from the side on which it reaches
 """
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,12 +19,15 @@ _MARK = "var(--best)"
 _SCANNER, _PART = "var(--t0)", "var(--soft)"
 
 
-def machine_svg(run: RunData, errs: str = "", centre_of_part: Array | None = None) -> str:
+def machine_svg(
+    run: RunData, errs: Sequence[str] = (), centre_of_part: Array | None = None, suspected: bool = False
+) -> str:
     """Return the machine as SVG; empty where no arm is known.
 
     Args:
-        errs: what is marked: joint 5, the scanner's mount, the part, the scanner, the arm; empty for nothing.
+        errs: what is marked: joint 5, the scanner's mount, the part, the scanner, the arm, the robot's base.
         centre_of_part: (3,) reference frame; None: of the stitched cloud.
+        suspected: none of them is known to err: they are marked with a question, and nothing moves.
     """
     robot, joints = run.session.robot, run.measurement.views.joints
     if robot is None or not joints.shape[1]:
@@ -39,9 +43,9 @@ def machine_svg(run: RunData, errs: str = "", centre_of_part: Array | None = Non
     if centre_of_part is None:
         centre_of_part = run.fused.points.mean(axis=0) if len(run.fused.points) else np.zeros(3)
     centre = (T_reference @ np.append(centre_of_part, 1.0))[:3]
-    joint = re.fullmatch(r"joint (\d+)", errs)
+    joints_marked = [int(number) - 1 for place in errs for number in re.findall(r"joint (\d+)", place)]
     arm = chain[:, :3, 3]
-    moved = None if joint is None else _magnified(run, q, int(joint[1]) - 1, arm)
+    moved = _magnified(run, q, joints_marked[0], arm) if joints_marked and not suspected else None
     every = np.vstack([arm, T_scanner[:3, 3], centre, *([] if moved is None else [moved])])
     flat = _projection(every, arm)
     lines = [_line(flat[: len(arm)], "var(--bar)", 9.0)]
@@ -53,25 +57,28 @@ def machine_svg(run: RunData, errs: str = "", centre_of_part: Array | None = Non
         lines.append(_line(np.array([flat[len(arm) - 1], part]), "var(--bar)", 4.0))
     else:
         lines.append(_line(np.array([flat[len(arm) - 1], scanner]), "var(--bar)", 4.0))
-    at_scanner, at_part = errs in ("the scanner", "the scanner's mount"), errs == "the part"
+    said = " and ".join(errs)
+    at_scanner, at_part, at_base = (name in said for name in ("scanner", "part", "base"))
     right = bool(scanner[0] > part[0])
-    name = "mount" if "mount" in errs else "scanner"
+    name = "mount" if "mount" in said else "scanner"
+    if at_base:
+        lines.append(_box(flat[0], 14, _MARK, "base?" if suspected else "base", True))
     lines.append(_box(scanner, 16, _MARK if at_scanner else _SCANNER, name, right))
     lines.append(_box(part, 22, _MARK if at_part else _PART, "part", not right))
     axes = link_frames(robot, q)[:-1] @ robot.before
     places = _projection(axes[:, :3, 3], arm, every)
-    marked = range(len(places)) if errs == "the arm" else [] if joint is None else [int(joint[1]) - 1]
+    marked = range(len(places)) if "the arm" in errs else joints_marked
     for k in sorted(range(len(places)), key=lambda k: k in marked):
         x, y = places[k]
         fill, size = (_MARK, 11.0) if k in marked else ("var(--line)", 5.0)
         lines.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" fill="{fill}" stroke="var(--soft)"/>')
         if k in marked:
             text = f'x="{x:.1f}" y="{y + 4:.1f}" text-anchor="middle"'
-            lines.append(f'<text {text} class="machine-number">{k + 1}</text>')
-    said = f"Arm, scanner and part; marked: {errs}" if errs else "Arm, scanner and part"
+            lines.append(f'<text {text} class="machine-number">{k + 1}{"?" if suspected else ""}</text>')
+    marks = f"; {'suspected' if suspected else 'marked'}: {said}" if errs else ""
     return (
-        f'<svg class="plot-svg" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" aria-label="{said}">'
-        f"{''.join(lines)}</svg>"
+        f'<svg class="plot-svg" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+        f'aria-label="Arm, scanner and part{marks}">{"".join(lines)}</svg>'
     )
 
 

@@ -14,7 +14,7 @@ from stitch.diagnosis.systematic_laws import law_of
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
-from stitch.output.finding_screen import finding_screen
+from stitch.output.finding_screen import effects_tried, finding_screen
 from stitch.output.plain_finding import (
     command_without_a_view,
     largest_error_sources,
@@ -109,7 +109,7 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
         }
         for row in rows
     ]
-    tried = sum(c.ranked.score.observable for c in found.candidates)
+    others = effects_tried(found) - len(screen["candidates"])
     titles = {"adequate": "Tried beside the model", "unknown_effect": "No known effect explains it"}
     return {
         "title": titles.get(found.verdict, "What is missing?"),
@@ -118,7 +118,7 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
         "unseen": screen["unseen"],
         "untested": screen["untested"],
         "noise": length_text(screen["noise"], unit, 2),
-        "others": tried - len(screen["candidates"]),
+        "others": f"{others} {'more effects' if screen['candidates'] else 'effects'} were tried" if others else "",
     }
 
 
@@ -167,17 +167,30 @@ def _typed(command: str) -> str:
 
 def _machine(found: Diagnosis, screen: dict[str, Any], state: RunData) -> str:
     """Return the machine with what errs marked; after an effect was added what it cures."""
-    of = screen["why"]["of"] if screen["why"] is not None else ""
-    if found.verdict == "unknown_effect" and found.laws:
-        of = law_of(found.laws[0]).place.name
-    drawing = machine_svg(state, of, found.linear.observation.centre)
+    places, is_one = _places(found, screen)
+    drawing = machine_svg(state, places, found.linear.observation.centre, suspected=not is_one)
     if not drawing:
         return ""
-    titles = {"adequate": f"The machine: {of}, in the model", "cannot_tell": f"The machine: {of}, or another part"}
-    title = titles.get(found.verdict, f"The machine: {of} errs") if of and of != "the views" else "The machine"
-    if found.verdict == "cannot_tell" and len({c["why"]["of"] for c in screen["candidates"][:2] if c["why"]}) == 1:
-        title = f"The machine: {of} errs"
+    title = "The machine"
+    if places and is_one:
+        title += f": {places[0]}{', in the model' if found.verdict == 'adequate' else ' errs'}"
+    elif places:
+        title += f". Suspected: {', '.join(places)}"
     return f'<div class="card machine"><h2>{_words(title)}</h2>{drawing}</div>'
+
+
+def _places(found: Diagnosis, screen: dict[str, Any]) -> tuple[list[str], bool]:
+    """Return where the error comes from or may come from, and whether that place is the only one."""
+    rivals = found.verdict == "cannot_tell" or (found.verdict == "missing_effect" and not found.certain)
+    if found.laws and found.verdict in ("unknown_effect", "cannot_tell"):
+        told = [law_of(ranked).place.name for ranked in found.laws]
+    else:
+        told = [screen["why"]["moves"]] if screen["why"] is not None else []
+    if rivals:
+        named = (c["why"] for c in screen["candidates"] if c["effect"] in found.effects)
+        told = [*(why["moves"] for why in named if why), *told]
+    places = [place for place in dict.fromkeys(told) if place != "the views"]
+    return places, len(places) == 1 and not rivals and " or " not in places[0]
 
 
 def _evidence(found: Diagnosis, unit: str) -> str:

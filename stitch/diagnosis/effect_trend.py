@@ -433,7 +433,7 @@ def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
         length = max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
         return _Motion("the scanner's mount", unit, columns / length, response, twist=along / length)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
-    of = "the part" if term.effect.place == "part" else "the arm"
+    of = {"part": "the part", "base": "the robot's base"}.get(term.effect.place, "the arm")
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
 
 

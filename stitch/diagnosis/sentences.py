@@ -1,5 +1,6 @@
 """The diagnosis in plain sentences with its numbers: one fact each, what was found first, what to do last."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.ranking import Ranked, beyond_belief_text
 from stitch.diagnosis.residual_structure import NOT_REPEATING
-from stitch.diagnosis.systematic_laws import law_of, law_size
+from stitch.diagnosis.systematic_laws import Law, law_of, law_size
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
@@ -193,14 +194,30 @@ def _allowed(d: Diagnosis, length_unit: str) -> str:
 
 def unnamed_in_words(d: Diagnosis) -> list[str]:
     """Return what has no name of its own and explains the views as well as what is named, or what is found instead."""
-    return [*(law_of(r).words for r in d.laws), *([d.rival_trend] if d.rival_trend else [])]
+    laws = dict.fromkeys(law_in_words(law_of(r)) for r in d.laws)
+    return [*laws, *([d.rival_trend] if d.rival_trend else [])]
+
+
+def law_in_words(law: Law) -> str:
+    """Return a law as people call it: joint 5 follows ambient_c (a line).
+
+    A number of periods a turn is told only where the driven range holds a whole one.
+    """
+    joint = re.match(r"j(\d+)_deg(?=$|,)", law.driver.name)
+    if joint is None:
+        return law.words
+    angle = "its angle" if law.place.name == f"joint {joint[1]}" else f"the angle of joint {joint[1]}"
+    if not law.in_part_of_a_wave:
+        return f"{law.place.name} follows {angle} ({law.shape})"
+    driven = float(np.ptp(law.driver.values))
+    return f"the error of {law.place.name} changes with {angle}, over the {driven:.0f}° driven"
 
 
 def _laws_found(d: Diagnosis) -> Iterator[str]:
     """Say which laws of the dictionary do, with their sizes, and what to do."""
     if not d.laws:
         return
-    told = [f"{law_of(r).words} by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
+    told = [f"{law_in_words(law_of(r))} by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
     among = "A law does" if len(told) == 1 else "One of these laws does, and these views cannot tell which"
     yield f"{among}: {_listed(told, 'or')} (p = {d.laws[0].adjusted:.1g})."
     yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."

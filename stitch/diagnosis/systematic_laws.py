@@ -40,6 +40,13 @@ from stitch.session.measurement import TEMPERATURES, Views
 from stitch.session.robot import Links
 
 TIME = "time_s"
+# Waves along a joint's angle, and how many there are a turn.
+_WAVES = {
+    "a wave, once a turn": 1,
+    "a wave, twice a turn": 2,
+    "a wave, three times a turn": 3,
+    "a wave, four times a turn": 4,
+}
 # What views follow in their order: a step from some view on, or where no time is stated a trend.
 STEP = "view order"
 NUMBER = "view number"
@@ -156,6 +163,12 @@ class Law:
         """(n, k·R) columns of the reduced observations."""
         moved = self.place.twists[:, :, self.columns, None] * self.shapes[:, None, None, :]
         return observation.from_twists(moved.reshape(6 * len(moved), -1))
+
+    @property
+    def in_part_of_a_wave(self) -> bool:
+        """True where the driven range holds no whole period: how many a turn has is not known."""
+        periods = _WAVES.get(self.shape)
+        return periods is not None and periods * float(np.ptp(self.driver.values)) < 360
 
     @property
     def words(self) -> str:
@@ -521,11 +534,10 @@ def drivers_of(views: Views) -> Iterator[Driver]:
     for k, angle in enumerate(views.joints.T):
         if np.ptp(angle) < _STILL:
             continue
-        waves = [np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for n in (1, 2, 3, 4)]
-        turns = {"a wave, once a turn": waves[0], "a wave, twice a turn": waves[1]}
-        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, kinds=_NOT_LINKS)
+        waves = {shape: np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for shape, n in _WAVES.items()}
         # Errors of a gear of one and two periods a turn have a name; those of three and four have not.
-        teeth = {"a wave, three times a turn": waves[2], "a wave, four times a turn": waves[3]}
+        turns, teeth = ({shape: waves[shape] for shape, n in _WAVES.items() if (n > 2) == short} for short in (0, 1))
+        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, kinds=_NOT_LINKS)
         yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), teeth, k + 1)
         moves = np.degrees(angle - views.previous[:, k])
         yield from _lines(f"j{k + 1}_move_deg", "deg", moves)

@@ -8,6 +8,7 @@ import numpy as np
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
+from stitch.diagnosis.sentences import law_in_words
 from stitch.diagnosis.systematic_laws import law_of, law_size
 from stitch.diagnosis.validation import CrossValidation
 from stitch.output.finding_screen import clearest_parameter, finding_screen
@@ -124,7 +125,7 @@ def _law_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     for ranked in diagnosis.laws:
         law = law_of(ranked)
         size, sigma, unit = law_size(diagnosis.linear, ranked)
-        row = {"place": law.place.name, "follows": law.driver.name, "shape": law.shape, "words": law.words}
+        row = {"place": law.place.name, "follows": law.driver.name, "shape": law.shape, "words": law_in_words(law)}
         rows.append(row | {"size": size, "sigma": sigma, "unit": unit, "p_value": ranked.adjusted})
     return rows
 

@@ -20,7 +20,7 @@ from stitch.diagnosis.effect_trend import (
     trends_of_candidates,
 )
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
-from stitch.diagnosis.sentences import fitted_amounts, odds_text
+from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
@@ -29,7 +29,7 @@ from stitch.numerics.least_squares import project_out
 from stitch.numerics.units import angle_text, display_unit, length_text
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches
 from stitch.output.comparison.model_history import model_history
-from stitch.output.plain_finding import law_in_words, open_doubts
+from stitch.output.plain_finding import open_doubts
 from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, effect_description, plain_covariate
 from stitch.system.threads import remembered
 
@@ -42,6 +42,8 @@ _FINE = 1e-3
 _WORSE = 0.03
 # What an effect changes over the views by less than this share of its size is the same in all.
 _FLAT = 0.02
+# An effect of which the plot shows less than this share is told with what the hand-eye takes of it.
+_MOSTLY = 0.9
 # A parameter of so many sigmas is clear, and so many links are told by their numbers.
 _CLEAR, _MOST_LINKS = 5.0, 2
 # A chance that needs no number.
@@ -60,7 +62,7 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
     why = _why(diagnosis, trends)
     return {
         "headline": _headline(diagnosis, trends),
-        "proof": _proof(diagnosis, why),
+        "proof": _proof(diagnosis, candidates, trends, present, if_added),
         "certainty": certainty(diagnosis),
         "now": {"heldout": diagnosis.heldout_rms} | _on_part(present),
         "noise": diagnosis.noise_floor,
@@ -154,7 +156,8 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
     if named.cross_validation is not None and validation is not None:
         more = left - diagnosis.rms_if_added(named.cross_validation)[1]
         if more > _WORSE * left:
-            return f"{'yes, though' if is_named else 'no:'} it leaves {length_text(more, unit, 1)} more"
+            told, least = (length_text(value, unit, 2) for value in (left, left - more))
+            return f"{'yes, though' if is_named else 'no:'} it leaves {told} instead of {least}"
     if is_named:
         rarer = candidate.ranked.log_belief < named.ranked.log_belief
         return "yes, though met more rarely (a judgement)" if rarer else "yes"
@@ -200,21 +203,24 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
 
 
 def _formula(diagnosis: Diagnosis) -> str:
-    """Return the law that is drawn and its numbers; empty where it has no name."""
+    """Return the law that is drawn and its numbers, that of each rival where none is named; empty without a name."""
     if diagnosis.verdict in _NAMING:
-        named = diagnosis.named[0]
-        return f"{named.score.candidate.effect.formula}; {fitted_amounts(named)}"
+        laws = [f"{r.score.candidate.effect.formula}; {fitted_amounts(r)}" for r in diagnosis.named]
+        if diagnosis.verdict == "missing_effect":
+            return f"The law: {laws[0]}."
+        shown = zip(diagnosis.effects, laws[:_BEST], strict=False)
+        return " ".join(f"If it is {effect}: {law}." for effect, law in shown)
     if diagnosis.verdict != "adequate" or not diagnosis.linear.model.effects:
         return ""
     term = diagnosis.linear.model.terms[-1]
     amounts = [f"{p.name} = {p.formatted}" for p in term.parameters if p.fitted or p.grid]
-    return f"{term.effect.formula}; {', '.join(amounts)}"
+    return f"The law: {term.effect.formula}; {', '.join(amounts)}."
 
 
 def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
     if trend is None:
         return None
-    words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
+    words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "moves", "value_unit")}
     numbers = ("at", "measured", "sigma", "predicted", "predicted_sigma")
     dots = {key: _rounded(getattr(trend, key)) for key in numbers}
     after = None if trend.after is None else _rounded(trend.after)
@@ -239,24 +245,29 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
                 by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
                 follows = ": each scan errs by itself" if by_view else ": the scanner errs over its field of view"
             elif diagnosis.laws:
-                follows = f": {' or '.join(map(law_in_words, diagnosis.laws))}"
+                follows = f": {' or '.join(unnamed_in_words(diagnosis))}"
             elif diagnosis.curves:
                 follows = f": the error follows joint {diagnosis.curves[0].joint}"
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
             return f"Something is missing that no known effect explains{follows}."
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
-    if len(named) > 1:
-        return _rivals(named, trends)
+    if diagnosis.verdict == "cannot_tell":
+        return _rivals(named, trends, unnamed_in_words(diagnosis))
     return f"{'' if diagnosis.certain else 'Perhaps: '}{_cause(named[0], trends.get(named[0].name))}."
 
 
 def _tested(diagnosis: Diagnosis, which: str) -> str:
     """Return among how many effects none was found, and how many could not be tested."""
-    seen = sum(c.ranked.score.observable for c in diagnosis.candidates)
-    untested = len(diagnosis.candidates) - seen + len(diagnosis.missing)
+    tried = effects_tried(diagnosis)
+    untested = len(diagnosis.candidates) - tried + len(diagnosis.missing)
     others = f"; {untested} could not be tested" if untested else ""
-    return f"No {which}effect was found among {seen}{others}."
+    return f"No {which}effect was found among {tried}{others}."
+
+
+def effects_tried(diagnosis: Diagnosis) -> int:
+    """Return how many effects were tried: those that these views could show."""
+    return sum(c.ranked.score.observable for c in diagnosis.candidates)
 
 
 def untested_text(diagnosis: Diagnosis) -> str:
@@ -335,18 +346,24 @@ def clearest_parameter(candidate: CandidateEffect) -> str | None:
     return min(detectable, key=lambda name: detectable[name] / plausible[name]) if detectable else None
 
 
-def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) -> str:
-    """Return what these views cannot tell apart, in two sentences where it is one joint."""
+def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend], unnamed: Sequence[str]) -> str:
+    """Return what these views cannot tell apart, in two sentences where it is one joint.
+
+    Args:
+        unnamed: what explains the views as well and has no name, in words.
+    """
     joints = {trends[c.name].moves if c.name in trends else "" for c in named}
     joint = joints.pop() if len(joints) == 1 else ""
     names = [c.name for c in named]
-    if joint.startswith("joint") and all(name in JOINT_DESCRIPTIONS for name in names):
+    if joint.startswith("joint") and not unnamed and all(name in JOINT_DESCRIPTIONS for name in names):
         if set(names) == {"gear_eccentricity", "gear_harmonic"}:
             which = "it errs once or twice a turn"
             return f"{joint.capitalize()} has an uneven gear. These views cannot tell whether {which}."
         which = " or ".join(JOINT_DESCRIPTIONS[name] for name in names)
         return f"{joint.capitalize()} errs. These views cannot tell whether it {which}."
-    causes = [_cause(c, trends.get(c.name)) for c in named]
+    causes = [*(_cause(c, trends.get(c.name)) for c in named), *unnamed]
+    if len(causes) == 1:
+        return f"Perhaps: {causes[0]}. These views cannot tell."
     which = ", or ".join(cause[:1].lower() + cause[1:] for cause in causes)
     return f"{which[:1].upper()}{which[1:]}: these views cannot tell which."
 
@@ -384,38 +401,67 @@ def _clear_links(candidate: CandidateEffect) -> list[str]:
     return sorted(clear) if len(clear) <= _MOST_LINKS else []
 
 
-def _proof(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
-    """Return how large it is, and what it does to the error on views left out."""
+def _proof(
+    diagnosis: Diagnosis,
+    candidates: Sequence[CandidateEffect],
+    trends: dict[str, EffectTrend],
+    present: DisagreementField | None,
+    if_added: dict[str, DisagreementField],
+) -> str:
+    """Return how large it is, and what it does to the error on views left out and to the worst place of the part.
+
+    No size is told where no single effect is named.
+    """
     unit = diagnosis.linear.measurement.length_unit
     now = length_text(diagnosis.heldout_rms, unit, 2)
     noise = length_text(diagnosis.noise_floor, unit, 2)
     error = f"The error on held-out views is {now}; the scanner's noise alone would leave {noise}."
     if diagnosis.verdict not in _NAMING:
         return error
-    validation = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0]).cross_validation
-    size = "" if why is None else f"{_size(why, unit)} "
-    if validation is None:
+    named = [c for c in candidates if c.name in diagnosis.effects]
+    is_one = diagnosis.verdict == "missing_effect"
+    why = trends.get(diagnosis.effects[0])
+    size = f"{_size(why, unit)} " if is_one and why is not None else ""
+    left = [diagnosis.rms_if_added(c.cross_validation)[1] for c in named if c.cross_validation is not None]
+    if not left:
         return f"{size}{error}"
-    then = length_text(diagnosis.rms_if_added(validation)[1], unit, 2)
+    which = "this effect" if is_one else "one of these"
+    then = " or ".join(dict.fromkeys(length_text(x, unit, 2) for x in left))
+    worse = _worse_place(named[0].name, present, if_added.get(named[0].name), unit)
     return (
-        f"{size}Adding this effect to the model should take the error on held-out views from {now} to {then}. "
+        f"{size}Adding {which} to the model should take the error on held-out views from {now} to {then}{worse}. "
         f"The scanner's noise alone would leave {noise}."
     )
 
 
+def _worse_place(effect: str, present: DisagreementField | None, then: DisagreementField | None, unit: str) -> str:
+    """Return what an effect does to the worst place of the part where that grows; empty elsewhere."""
+    if present is None or then is None:
+        return ""
+    before, after = (length_text(float(np.nanmax(field.overall)), unit, 2) for field in (present, then))
+    grows = np.nanmax(then.overall) > np.nanmax(present.overall) and before != after
+    return f", though {effect} takes the worst place of the part from {before} to {after}" if grows else ""
+
+
 def _size(why: EffectTrend, unit: str) -> str:
-    """Return how far off an effect puts things, as a sentence."""
-    largest = float(np.abs(why.effect).max())
-    size = angle_text(largest, 2) if why.value_unit == "rad" else length_text(largest, unit, 2)
+    """Return how far off an effect puts things, and how much of that the hand-eye takes, as a sentence."""
+
+    def told(value: float) -> str:
+        return angle_text(value, 2) if why.value_unit == "rad" else length_text(value, unit, 2)
+
+    largest, drawn = (float(np.abs(values).max()) for values in (why.effect, why.predicted))
+    size = told(largest)
     away = int(np.sum(np.abs(why.effect) > largest / 2))
     if why.follows == "view order" and away <= len(why.views) / 2:
         return f"{away} of {len(why.views)} views sit {size} away from the others."
+    # What the plot shows is what the hand-eye leaves.
+    taken = f", of which the hand-eye takes all but {told(drawn)}" if drawn < _MOSTLY * largest else ""
     follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
     if np.ptp(why.effect) < _FLAT * largest:
-        return f"{why.of.capitalize()} is off by {size}, whatever {article}{follows} is."
+        return f"{why.of.capitalize()} is off by {size}{taken}, whatever {article}{follows} is."
     goes_with = "" if follows == "view order" else f"; it goes with {article}{follows}"
-    return f"{why.of.capitalize()} is off by up to {size}{goes_with}."
+    return f"{why.of.capitalize()} is off by up to {size}{taken}{goes_with}."
 
 
 def certainty(diagnosis: Diagnosis) -> str:
@@ -428,7 +474,7 @@ def certainty(diagnosis: Diagnosis) -> str:
             named = next(c.ranked for c in diagnosis.candidates if c.name == diagnosis.effects[0])
             among = named.posterior / sum(c.ranked.posterior for c in diagnosis.candidates)
             share = "more than 99%" if among > 0.99 else f"{among:.0%}"
-            evidence = f"Of {named.tests} known effects tried, it holds {share} of the evidence."
+            evidence = f"Of {effects_tried(diagnosis)} known effects tried, it holds {share} of the evidence."
             nameless = " Its cause is less sure: a curve without a name would explain as much."
             return f"{chance_text(named.adjusted)} {evidence}{nameless if named.posterior <= 0.5 else ''}"
         case "cannot_tell":

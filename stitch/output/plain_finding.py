@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.sentences import odds_text, unnamed_in_words
 from stitch.diagnosis.systematic_laws import law_of
@@ -22,6 +21,8 @@ from stitch.run_data import doubt_headline, effect_cure
 # Sources of the error below this share of the variance stand in one line.
 _MIN_SHARE = 0.01
 OTHER_SOURCES = "others"
+# These scans are saved by the model; what is mended at the machine serves the next ones.
+_AFTER_ADDING = ", after adding it and before new scans"
 
 
 def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
@@ -111,7 +112,7 @@ def _error_location(diagnosis: Diagnosis) -> str:
     if diagnosis.follows_field:
         return ": the scanner's error depends on the position in its field of view"
     if diagnosis.laws:
-        return f": {' or '.join(map(law_in_words, diagnosis.laws))}"
+        return f": {' or '.join(unnamed_in_words(diagnosis))}"
     if diagnosis.curves:
         joints = " or ".join(dict.fromkeys(c.place for c in sorted(diagnosis.curves, key=lambda c: c.joint)))
         return f": the error follows {joints}, but no known formula"
@@ -119,7 +120,8 @@ def _error_location(diagnosis: Diagnosis) -> str:
         return ": the pose errors change over time, but follow no known formula"
     if diagnosis.overlap_misfit:
         return ": the scanner or the part's shape is wrong, not only the poses"
-    follows = [x.covariate for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
+    clear = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
+    follows = [*dict.fromkeys(clear)]
     if follows:
         where = f", at {' or '.join(diagnosis.places)}" if diagnosis.places else ""
         return f": the remaining error follows {' and '.join(follows[:2])}{where}"
@@ -127,18 +129,12 @@ def _error_location(diagnosis: Diagnosis) -> str:
     return f": {diagnosis.notes[0]}" if diagnosis.notes else ""
 
 
-def law_in_words(ranked: Ranked) -> str:
-    """Return a law of the dictionary as people call it: joint 5 follows the angle of joint 5 (a line)."""
-    law = law_of(ranked)
-    return law.words.replace(law.driver.name, plain_covariate(law.driver.name))
-
-
 def remedy_at_machine(diagnosis: Diagnosis) -> str:
     """Return what would end the effect that is named, or where to look for one without a name, as a sentence.
 
     Empty where something is missing without a place to look, or only perhaps.
     """
-    remedy = ""
+    remedy, when = "", ""
     if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
         by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
         remedy = "" if by_view else "have the scanner calibrated"
@@ -155,13 +151,16 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
         follows = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
         remedy = f"look for what changes with {follows[0]}" if follows else ""
     elif diagnosis.verdict == "missing_effect" and diagnosis.certain:
-        remedy = REMEDIES.get(diagnosis.effects[0], "")
+        remedy, when = REMEDIES.get(diagnosis.effects[0], ""), _AFTER_ADDING
     elif diagnosis.verdict == "cannot_tell" and diagnosis.certain and not unnamed_in_words(diagnosis):
         remedies = {REMEDIES.get(effect, "") for effect in diagnosis.effects}
         remedy = remedies.pop() if len(remedies) == 1 else "change nothing until it is known which"
     elif diagnosis.verdict == "adequate":
-        remedy = "nothing to mend was found"
-    return f"At the machine: {remedy}." if remedy else ""
+        added = dict.fromkeys(REMEDIES.get(effect, "") for effect in diagnosis.linear.model.effects)
+        remedy, when = "; ".join(filter(None, added)), _AFTER_ADDING
+        if not remedy:
+            return "Nothing to do at the machine."
+    return f"At the machine{when}: {remedy}." if remedy else ""
 
 
 def suggested_command(diagnosis: Diagnosis, run: str) -> str:

@@ -18,13 +18,13 @@ DESCRIPTIONS = {
     "joint_thermal": "joints turn with a temperature",
     "link_thermal": "links of the arm grow with a temperature",
     "joint_step": "a joint lost counts between two views",
-    "mount_drift": "the scanner's mount creeps",
+    "mount_drift": "the scanner's mount drifts",
     "mount_warmup": "the scanner's mount moves while it warms up",
     "mount_creep": "the scanner's mount settles, fast at first and ever slower",
     "mount_step": "the scanner moved on its mount between two views",
     "mount_droop": "the scanner's mount gives way under its weight",
     "mount_bend": "the scanner's oblique bracket gives way under its weight",
-    "fixture_drift": "the part's fixture creeps",
+    "fixture_drift": "the part's fixture drifts",
     "fixture_droop": "the part's fixture gives way under its weight",
     "fixture_bend": "the part's oblique fixture gives way under its weight",
     "part_slip": "the part slipped between two views",
@@ -114,5 +114,5 @@ def effect_in_words(name: str) -> str:
 
 def plain_covariate(name: str) -> str:
     """Return a covariate as people call it: j2_deg is the angle of joint 2."""
-    joint = re.fullmatch(r"j(\d+)_deg(, .*)?", name)
-    return f"the angle of joint {joint[1]}{joint[2] or ''}" if joint else covariate_text(name).partition(" (")[0]
+    joint = re.fullmatch(r"j(\d+)_deg(, in short waves)?", name)
+    return f"the angle of joint {joint[1]}" if joint else covariate_text(name).partition(" (")[0]

@@ -78,7 +78,8 @@ def test_more_than_an_expected_scatter_is_said_with_what_is_expected():
     assert "ordinary arms stay below 40 µm and 0.045 mrad. So more is left than scatter explains." in told
 
 
-NOT_FITTED = SimpleNamespace(fitted=False)
+_LASTING = SimpleNamespace(term=SimpleNamespace(parameters=()))
+NOT_FITTED = SimpleNamespace(fitted=False, form=_LASTING)
 
 
 def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:

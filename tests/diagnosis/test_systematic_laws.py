@@ -13,7 +13,18 @@ from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
 from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
-from stitch.diagnosis.systematic_laws import GRAVITY, STEP, dictionary_of, law_of, law_size, rank_laws
+from stitch.diagnosis.sentences import law_in_words
+from stitch.diagnosis.systematic_laws import (
+    GRAVITY,
+    STEP,
+    Driver,
+    Law,
+    Place,
+    dictionary_of,
+    law_of,
+    law_size,
+    rank_laws,
+)
 from stitch.effects.contract import EFFECTS, effect, twist
 from stitch.numerics.reml import fit_variances
 
@@ -68,6 +79,24 @@ def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, w
     value, sigma, _ = law_size(linear, found[0])
     moved = np.ptp(law.shapes, axis=0).max() * size.max()
     assert abs(value - moved) < 4 * sigma + (0.3 if law.place.joint is None else 0.0) * moved
+
+
+@pytest.mark.parametrize(
+    ("driven", "said"),
+    [
+        (76, "the error of joint 5 changes with its angle, over the 76° driven"),
+        (119, "the error of joint 5 changes with its angle, over the 119° driven"),
+        (121, "joint 5 follows its angle (a wave, three times a turn)"),
+    ],
+)
+def test_how_many_waves_a_turn_has_is_said_only_where_a_whole_one_was_driven(driven, said):
+    shape = "a wave, three times a turn"
+    angles = np.linspace(25.0, 25.0 + driven, 18)
+    place = Place("joint 5", np.zeros((18, 6, 1)), np.ones(1), np.arange(1), ("rad",), joint=5)
+    law = Law(place, Driver("j5_deg, in short waves", "deg", angles, {shape: np.zeros((18, 2))}, 5), shape, place.whole)
+    assert law_in_words(law) == said
+    base = replace(law, place=replace(place, name="joint 1 or the base"))
+    assert ("the angle of joint 5" in law_in_words(base)) and ("a turn" in law_in_words(base)) == (driven > 120)
 
 
 @pytest.mark.parametrize("still", [True, False])

@@ -183,8 +183,8 @@ def _found(
 @pytest.mark.parametrize(
     ("found", "said"),
     [
-        (_found("missing_effect", 1e-46), "less than one of a million sessions (p = 1e-46). Of 21 known effects tried"),
-        (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 21 known effects tried, it holds 97%"),
+        (_found("missing_effect", 1e-46), "less than one of a million sessions (p = 1e-46). Of 1 known effects tried"),
+        (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 1 known effects tried, it holds 97%"),
         (
             _found("missing_effect", 1e-3, posterior=0.22),
             "it holds 97% of the evidence. Its cause is less sure: a curve without a name would explain as much.",
@@ -216,6 +216,59 @@ def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
     for by_view, told in ((False, "At the machine: have the scanner calibrated."), (True, "")):
         found.follows_field, found.scanner_error = True, SimpleNamespace(by_view=by_view)
         assert remedy_at_machine(found) == told
+
+
+def test_it_is_said_when_to_act_at_the_machine():
+    """The scans at hand are saved by the model; what is mended serves the next ones."""
+    mount = "fasten the scanner's mount."
+    said = remedy_at_machine(finding("missing_effect", "mount_drift"))
+    assert said == f"At the machine, after adding it and before new scans: {mount}"
+    for effects, told in (((), "Nothing to do at the machine."), (("mount_drift",), said)):
+        added = SimpleNamespace(model=SimpleNamespace(effects=effects))
+        assert remedy_at_machine(finding("adequate", linear=added)) == told
+
+
+def _trend(effect, drawn, **more):
+    usual = {
+        "effect": np.array(effect),
+        "predicted": np.array(drawn),
+        "views": np.arange(len(effect)),
+        "of": "the mount",
+    }
+    return SimpleNamespace(**usual | {"value_unit": "mm", "follows": "time"} | more)
+
+
+@pytest.mark.parametrize(
+    ("trend", "said"),
+    [
+        (
+            _trend([0, 0.1, 0.183], [-0.09, 0, 0.08]),
+            "is off by up to 183 µm, of which the hand-eye takes all but 90 µm; it",
+        ),
+        (_trend([-0.1, 0, 0.1], [-0.1, 0, 0.1]), "is off by up to 100 µm; it goes with time."),
+        (_trend([0, 0, 0.1], [0, 0, 0.1], follows="view order"), "1 of 3 views sit 100 µm away from the others."),
+        (_trend([0.1, 0.1, 0], [0.1, 0.1, 0], follows="view order"), "The mount is off by up to 100 µm."),
+    ],
+)
+def test_a_size_is_that_of_the_plot_or_says_what_the_hand_eye_takes(trend, said):
+    assert said in finding_screen._size(trend, "mm")
+
+
+@pytest.mark.parametrize(
+    ("then", "said"), [(0.098, "though play takes the worst place of the part from 68 µm to 98"), (0.05, "")]
+)
+def test_a_worst_place_that_grows_is_said_beside_the_gain(then, said):
+    before, after = (SimpleNamespace(overall=np.array([0.01, np.nan, worst])) for worst in (0.068, then))
+    told = finding_screen._worse_place("play", before, after, "mm")
+    assert said in told and bool(told) == bool(said)
+
+
+def test_a_cause_beside_a_curve_without_a_name_is_no_headline_by_itself(monkeypatch):
+    monkeypatch.setattr(finding_screen, "_cause", lambda candidate, trend: candidate.name)
+    found = _found("missing_effect", 1e-9)
+    found.verdict, found.rival_trend = "cannot_tell", "joint 3 errs along its angle"
+    told = finding_screen._headline(found, {})
+    assert "play, or joint 3 errs" in told.replace("Play", "play") and told.endswith("these views cannot tell which.")
 
 
 @pytest.mark.parametrize(("heldout", "shown"), [(0.5, 1), (1.1, 0)])

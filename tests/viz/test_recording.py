@@ -281,7 +281,7 @@ def circles(svg):
 
 
 def test_every_joint_is_drawn_and_the_one_that_errs_is_marked_and_moves(erring_run):
-    svg = machine_svg(erring_run, "joint 5")
+    svg = machine_svg(erring_run, ("joint 5",))
     fills = circles(svg)
     assert len(fills) == erring_run.session.robot.n_joints
     assert fills.count("var(--best)") == 1 and ">5</text>" in svg
@@ -296,13 +296,19 @@ def test_without_a_cause_nothing_is_marked(erring_run):
     "errs, name", [("the scanner's mount", "mount"), ("the scanner", "scanner"), ("the part", "part")]
 )
 def test_mount_scanner_and_part_are_marked_where_they_err(erring_run, errs, name):
-    svg = machine_svg(erring_run, errs)
+    svg = machine_svg(erring_run, (errs,))
     marked = re.search(r'fill="var\(--best\)"/><text[^>]*>(\w+)</text>', svg)
     assert marked[1] == name
 
 
+def test_suspects_are_marked_with_a_question_and_nothing_moves(erring_run):
+    svg = machine_svg(erring_run, ("joint 2", "the robot's base"), suspected=True)
+    assert ">2?</text>" in svg and ">base?</text>" in svg and svg.count('stroke-dasharray="5 4"') == 0
+    assert "suspected: joint 2 and the robot's base" in svg
+
+
 def test_everything_lies_within_the_picture(erring_run):
-    points = re.findall(r'points="([^"]*)"', machine_svg(erring_run, "joint 2"))
+    points = re.findall(r'points="([^"]*)"', machine_svg(erring_run, ("joint 2",)))
     places = np.array([pair.split(",") for line in points for pair in line.split()], float)
     assert (places > 0).all() and (places < [230, 250]).all()
 

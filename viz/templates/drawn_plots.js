@@ -51,7 +51,7 @@ function xyPlot(root, spec, height = 220, chosen = null) {
     const order = s.x.map((_, i) => i).sort((a, b) => s.x[a] - s.x[b]), tint = `tint-${s.tint ?? k}`;
     const path = (points, end = "") => `M${points.map(([x, y]) => `${X(x).toFixed(1)} ${Y(y).toFixed(1)}`).join("L")}${end}`;
     if (s.kind === "band") svg.append(svgNode("path", { class: `band ${tint}`, d: path([...order.map(i => [s.x[i], spread(s)(i, 1)]), ...order.reverse().map(i => [s.x[i], spread(s)(i, -1)])], "Z") }));
-    if (s.kind === "line") svg.append(svgNode("path", { class: `line ${tint}`, "stroke-dasharray": s.dashed ? "6 4" : null, d: s.step ? stepped(s, order, X, Y) : path(order.map(i => [s.x[i], s.y[i]])) }));
+    if (s.kind === "line") svg.append(svgNode("path", { class: `line ${tint}`, "stroke-dasharray": s.dashed, d: s.step ? stepped(s, order, X, Y) : path(order.map(i => [s.x[i], s.y[i]])) }));
     if (s.kind === "ticks") for (const x of s.x) svg.append(svgNode("line", { class: "tick", x1: X(x), x2: X(x), y1: Y(0) - 4, y2: Y(0) + 4 }));
     if (s.kind === "dots") s.x.forEach((x, i) => {
       const dot = svgNode("g", { class: `dot ${tint}` }, svgNode("line", { x1: X(x), x2: X(x), y1: Y(spread(s)(i, -1)), y2: Y(spread(s)(i, 1)) }),
@@ -69,7 +69,7 @@ function xyPlot(root, spec, height = 220, chosen = null) {
         dot.addEventListener("keydown", e => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); press(); } });
       }
       svg.append(dot);
-      if (s.label) svg.append(svgNode("text", { class: tint, x: X(x) + (X(x) > width / 2 ? -14 : 14), y: Y(s.y[i]) + (s.below ? 16 : -8), "text-anchor": X(x) > width / 2 ? "end" : "start" }, s.label));
+      if (s.label) svg.append(svgNode("text", { class: tint, x: X(x) + (X(x) > width / 2 ? -14 : 14), y: Y(s.y[i]) - 8 + 14 * (s.lower || 0), "text-anchor": X(x) > width / 2 ? "end" : "start" }, s.label));
     });
   });
   root.replaceChildren(svg);

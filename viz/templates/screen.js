@@ -101,6 +101,9 @@ function showScreen(root, part, found, um) {
     // As the light judges: with two standard errors, and no more of it than there is.
     const errors = part.sigma ? Float32Array.from(part.sigma).filter(Number.isFinite).sort() : [], least = allowed - 2 * (errors[errors.length >> 1] || 0);
     const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.floor(100 * seen.filter(v => v <= least).length / Math.max(seen.length, 1)); });
+    const worst = Math.max(0, ...both.flatMap(s => Array.from(s.values).filter(Number.isFinite))), beyond = at("beyond"), hatched = at("hatched");
+    if (beyond) beyond.textContent = worst > full ? `The darkest colour begins at ${roundLength(full)}; the worst place has ${roundLength(worst)}.` : "";
+    if (hatched) hatched.hidden = !views.some(v => v.hatched());
     const told = at("within");
     if (told) told.textContent = allowed ? `Within ${shortLength(allowed)}: ${within[0]} % → ${within[1]} %` : "";
   }
@@ -116,10 +119,10 @@ function showScreen(root, part, found, um) {
       xyPlot(place, { x: { label: "views in their order", names: part.names }, y: { label: "µm" }, series: [{ kind: "dots", x: seen.map(s => s[0]), y: seen.map(s => s[1]), names: true, said: seen.map(s => said[s[0]]), tint: "dot" }] }, 230, i => chooseView(i < 0 ? -1 : seen[i][0]));
       return;
     }
-    const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.slice(0, 2).map(e => found.candidates.find(c => c.effect === e.effect));
+    const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.map(e => found.candidates.find(c => c.effect === e.effect));
     const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their trend" : "what the effect predicts");
     title.textContent = plot.title;
-    if (!asked && found.formula) say(`The law: ${found.formula}.`);
+    if (!asked && found.formula) say(found.formula);
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
   }
   function chooseView(index) {
@@ -159,13 +162,13 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
   const [measured, sigma, predicted, about] = [course.measured, course.sigma, course.predicted, course.predicted_sigma].map(scaled);
-  const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
+  const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))(, in short waves)?$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
   const named_ = course.views.map(v => names ? names[v] : String(v)), middle = (Math.max(...predicted) + Math.min(...predicted)) / 2;
   const side = predicted.map(p => p > middle), first = inOrder ? side.findIndex(s => s !== side[0]) : -1;
   const jumps = first > 0 && side.slice(first).every(s => s !== side[0]);
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ± ${shortNumber(2 * about[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off without it in the model (${unit}), ± 2σ. Dots: measured${course.after ? ", open: with it in the model" : ""}. Line: ${course.of.endsWith("views") ? "means" : line}`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are off" : "is off without it in the model"} (${unit}), ± 2σ. Dots: measured${course.after ? ", open: with it in the model" : ""}. Line: ${course.of.endsWith("views") ? "their mean, bin by bin" : line}`,
     perUnit: seconds ? 1 / per : 1,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
@@ -175,17 +178,19 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   };
 }
 
-// Two rivals over the same dots, and in a stripe what each expects in the view that decides.
+// Rivals over the same dots, and in a stripe what each expects in the view that decides.
 function duelPlot(rivals, view, names, um) {
-  const [first, second] = rivals.map(c => coursePlot(c.why, names, um)), factor = rivals[0].why.value_unit === "rad" ? 1e3 : um, unit = first.spec.y.label;
-  const x = view.at * first.perUnit, tints = ["predicted", "0"], [, , dots] = first.spec.series;
-  const lines = [first, second].flatMap((plot, k) => plot.spec.series.slice(0, 2).map(s => ({ ...s, tint: tints[k], dashed: k === 1 })));
-  const expected = view.expected.slice(0, 2).map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [e.sigma * factor], tint: tints[k], open: true,
-    said: [`${e.effect} expects ${shortNumber(e.value * factor)} ± ${shortNumber(2 * e.sigma * factor)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${shortNumber(Number((e.value * factor).toPrecision(2)))} ± ${shortNumber(Number((2 * e.sigma * factor).toPrecision(2)))}`, below: e.value < view.expected[1 - k].value }));
-  const [a, b] = view.expected, apart = Math.abs(a.value - b.value) > 2 * Math.hypot(a.sigma, b.sigma);
+  const plots = rivals.map(c => coursePlot(c.why, names, um)), [first] = plots, factor = rivals[0].why.value_unit === "rad" ? 1e3 : um, unit = first.spec.y.label;
+  const x = view.at * first.perUnit, tints = ["predicted", "0", "2"], dashes = [null, "6 4", "2 3"], drawn = ["solid", "dashed", "dotted"], [, , dots] = first.spec.series;
+  const lines = plots.flatMap((plot, k) => plot.spec.series.slice(0, 2).map(s => ({ ...s, tint: tints[k], dashed: dashes[k] })));
+  const told = (value, sigma) => [value, 2 * sigma].map(v => shortNumber(Number((v * factor).toPrecision(2)))).join(" ± ");
+  const highest = view.expected.map((_, k) => k).sort((a, b) => view.expected[b].value - view.expected[a].value);
+  const expected = view.expected.map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [e.sigma * factor], tint: tints[k], open: true,
+    said: [`${e.effect} expects ${told(e.value, e.sigma)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${told(e.value, e.sigma)}`, lower: highest.indexOf(k) }));
+  const parted = expected.some((_, k) => expected.slice(k + 1).some((_, m) => { const a = view.expected[k], b = view.expected[k + 1 + m]; return Math.abs(a.value - b.value) > 2 * Math.hypot(a.sigma, b.sigma); }));
   return {
-    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that decides${apart ? "" : ", where they part in other directions than this one"}`,
-    spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ` ${rivals[0].why.unit}`}` }, series: [...lines, ...expected, dots] },
+    title: `${["", "", "Two", "Three"][rivals.length]} suspects, the same dots: how far ${rivals[0].why.of} is off with none of them in the model (${unit}), ± 2σ. ${rivals.map((c, k) => `${c.effect} ${drawn[k]}`).join(", ")}. Stripe: what each expects in the view that decides${parted ? "" : "; they part in other directions than this one"}`,
+    spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : `\u00a0${rivals[0].why.unit}`}` }, series: [...lines, ...expected, dots] },
   };
 }
 
@@ -247,9 +252,10 @@ function partStage(card, data, index) {
       const [x, y, z] = [0, 1, 2].map(k => normals[3 * i + k]);
       look.set({ ...look.now(), yaw: -Math.atan2(x, z), pitch: Math.atan2(y, Math.hypot(x, z)), panX: 0, panY: 0 }); draw();
     },
+    hatched: () => state.hatched,
     show(values, full, signed) {
-      state = { values, full, signed };
       const on = numbers.onVertices(values);
+      state = { values, full, signed, hatched: on.includes(UNKNOWN) };
       drawing.write(on, on); draw();
     },
     tag(next) { tags = next.map(t => ({ ...t })); draw(); },
