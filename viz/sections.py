@@ -162,7 +162,8 @@ def _purpose(why: str) -> str:
 
 def _typed(command: str) -> str:
     """Return a command with a button that copies it."""
-    return f'<p><code>{escape(command)}</code> <button type="button" data-copy>Copy</button></p>'
+    button = '<button type="button" title="Copies the command." data-copy>Copy</button>'
+    return f"<p><code>{escape(command)}</code> {button}</p>"
 
 
 def _machine(found: Diagnosis, screen: dict[str, Any], state: RunData) -> str:

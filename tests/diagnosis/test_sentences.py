@@ -88,7 +88,7 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
     found = SimpleNamespace(
         verdict=verdict,
         effects=effects,
-        candidates=[SimpleNamespace(name=name, ranked=ranked, cross_validation=None) for name in effects],
+        candidates=[SimpleNamespace(name=name, ranked=ranked, cross_validation=None, aliases={}) for name in effects],
         next=(),
         residual_rms=0.0132,
         noise_floor=0.0110,

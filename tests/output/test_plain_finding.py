@@ -80,6 +80,7 @@ def test_where_a_view_decides_it_comes_before_a_group():
     document = {"verdict": "cannot_tell", "effects": ["play", "sag"], "plain": "", "sentence": ""}
     assert told_diagnosis(document | {"next_command": command}, 1e3)["advised"] == "next"
     assert told_diagnosis(document | {"next_command": "Next: stitch add RUN --group"}, 1e3)["advised"] == "group"
+    assert told_diagnosis(document | {"next_command": "Next: stitch export RUN --to ros"}, 1e3)["advised"] == "export"
 
 
 def test_a_table_holds_no_number_that_did_not_decide():

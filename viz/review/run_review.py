@@ -189,6 +189,8 @@ class RunReview:
                 return ["add", run, "--group", *self._trusted()]
             case "explain":
                 return [kind, run, *self._trusted()]
+            case "export":
+                return [kind, run, "--to", "ros", *self._trusted()]
             case "undo" | "redo":
                 change = self.snapshot().state["history"][kind]
                 if change is None:

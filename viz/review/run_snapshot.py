@@ -113,8 +113,8 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
 
 
 def _advised(command: str) -> str:
-    """Return which step the command of a diagnosis is: add, group, next, explain; empty where it is none of them."""
-    step = re.search(r"stitch (add|next|explain)\b", command)
+    """Return which step the command of a diagnosis is: add, group, next, explain, export; empty where it is none."""
+    step = re.search(r"stitch (add|next|explain|export)\b", command)
     return "" if step is None else "group" if "--group" in command else step[1]
 
 

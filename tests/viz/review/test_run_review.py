@@ -119,6 +119,7 @@ def test_what_a_page_asks_for_beside_single_effects_are_commands_too(run):
     review = RunReview(run)
     assert review.arguments("next", {}) == ["next", str(run)]
     assert review.arguments("explain", {}) == ["explain", str(run)]
+    assert review.arguments("export", {}) == ["export", str(run), "--to", "ros"]
     assert review.arguments("group", {}) == ["add", str(run), "--group"]
 
 

@@ -4,6 +4,11 @@ import { send } from "./server.js";
 
 const jobs = new Map();
 const STATES = { waiting: "waits", running: "runs", done: "done", failed: "failed", stopped: "stopped" };
+// What a command does that nobody asked for.
+const UNASKED = {
+  compare: "Measures where the views disagree, for the plots below; the model stays as it is: ",
+  report: "Writes the page anew; the model stays as it is: ",
+};
 let begun = 0;
 
 export const running = () => [...jobs.values()].find(j => j.state === "running") || [...jobs.values()].find(j => j.state === "waiting");
@@ -27,13 +32,13 @@ function draw() {
   if (!job) {
     const last = [...jobs.values()].pop();
     at("doing").textContent = !last ? "Nothing is running." : last.state === "failed" ? `Failed: ${last.command}: ${last.lines[last.lines.length - 1] || ""}`
-      : `${last.state === "done" ? "Done" : "Stopped"}: ${last.command} (${Math.round(last.seconds)}\u00a0s)`;
+      : `${last.state === "done" ? "Done" : "Stopped"}: ${UNASKED[last.kind] || ""}${last.command} (${Math.round(last.seconds)}\u00a0s)`;
     now.classList.toggle("failed", Boolean(last) && last.state === "failed");
     return;
   }
   now.classList.remove("failed");
   const seconds = job.state === "running" ? ` · ${Math.round((performance.now() - begun) / 1000)}\u00a0s` : " · waits";
-  at("doing").textContent = `${job.command}${seconds}${told(job)}`;
+  at("doing").textContent = `${UNASKED[job.kind] || ""}${job.command}${seconds}${told(job)}`;
   const share = shareOf(job);
   if (share === null) at("bar").removeAttribute("value"); else at("bar").value = share;
 }
