@@ -25,7 +25,7 @@ def machine_svg(
     """Return the machine as SVG; empty where no arm is known.
 
     Args:
-        errs: what is marked: joint 5, the scanner's mount, the part, the scanner, the arm, the robot's base.
+        errs: what is marked: joint 5, link 4, the scanner's mount, the part, the scanner, the arm, the robot's base.
         centre_of_part: (3,) reference frame; None: of the stitched cloud.
         suspected: none of them is known to err: they are marked with a question, and nothing moves.
     """
@@ -49,6 +49,8 @@ def machine_svg(
     every = np.vstack([arm, T_scanner[:3, 3], centre, *([] if moved is None else [moved])])
     flat = _projection(every, arm)
     lines = [_line(flat[: len(arm)], "var(--bar)", 9.0)]
+    links = [int(number) for place in errs for number in re.findall(r"link (\d+)", place)]
+    lines += [_line(flat[k - 1 : k + 1], _MARK, 9.0) for k in links if k < len(arm)]
     if moved is not None:
         lines.append(_line(flat[len(arm) + 2 :], _MARK, 2.0, "5 4"))
     scanner, part = flat[len(arm)], flat[len(arm) + 1]

@@ -186,11 +186,10 @@ def _places(found: Diagnosis, screen: dict[str, Any]) -> tuple[list[str], bool]:
     if found.laws and found.verdict in ("unknown_effect", "cannot_tell"):
         told = [law_of(ranked).place.name for ranked in found.laws]
     else:
-        told = [screen["why"]["moves"]] if screen["why"] is not None else []
-    if rivals:
-        named = (c["why"] for c in screen["candidates"] if c["effect"] in found.effects)
-        told = [*(why["moves"] for why in named if why), *told]
-    places = [place for place in dict.fromkeys(told) if place != "the views"]
+        told = [screen["why"]["of"]] if screen["why"] is not None and not found.effects else []
+    among = found.effects if rivals else found.effects[:1]
+    named = (c["place"] for c in screen["candidates"] if c["effect"] in among)
+    places = [place for place in dict.fromkeys([*named, *told]) if place not in ("", "the views")]
     return places, len(places) == 1 and not rivals and " or " not in places[0]
 
 

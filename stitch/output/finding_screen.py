@@ -138,8 +138,15 @@ def _candidate_row(
         "heldout": None if validation is None else diagnosis.rms_if_added(validation)[1],
         **_on_part(field),
         "fits": _fits(diagnosis, candidate),
+        "place": _place(candidate, trend),
         "why": _trend_row(trend),
     }
+
+
+def _place(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
+    """Return what errs where a candidate is the cause: joint 2, link 4, the scanner's mount; empty where unknown."""
+    links = _clear_links(candidate) if candidate.name == "link_geometry" else []
+    return " and ".join(f"link {link}" for link in links) or ("" if trend is None else trend.moves)
 
 
 def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
@@ -220,7 +227,7 @@ def _formula(diagnosis: Diagnosis) -> str:
 def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
     if trend is None:
         return None
-    words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "moves", "value_unit")}
+    words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
     numbers = ("at", "measured", "sigma", "predicted", "predicted_sigma")
     dots = {key: _rounded(getattr(trend, key)) for key in numbers}
     after = None if trend.after is None else _rounded(trend.after)

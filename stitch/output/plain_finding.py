@@ -22,7 +22,7 @@ from stitch.run_data import doubt_headline, effect_cure
 _MIN_SHARE = 0.01
 OTHER_SOURCES = "others"
 # These scans are saved by the model; what is mended at the machine serves the next ones.
-_AFTER_ADDING = ", after adding it and before new scans"
+_AFTER_ADDING = ", after adding it"
 
 
 def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
@@ -157,7 +157,7 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
         remedy = remedies.pop() if len(remedies) == 1 else "change nothing until it is known which"
     elif diagnosis.verdict == "adequate":
         added = dict.fromkeys(REMEDIES.get(effect, "") for effect in diagnosis.linear.model.effects)
-        remedy, when = "; ".join(filter(None, added)), _AFTER_ADDING
+        remedy = "; ".join(filter(None, added))
         if not remedy:
             return "Nothing to do at the machine."
     return f"At the machine{when}: {remedy}." if remedy else ""

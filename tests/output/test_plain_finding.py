@@ -223,8 +223,8 @@ def test_it_is_said_when_to_act_at_the_machine():
     """The scans at hand are saved by the model; what is mended serves the next ones."""
     mount = "fasten the scanner's mount."
     said = remedy_at_machine(finding("missing_effect", "mount_drift"))
-    assert said == f"At the machine, after adding it and before new scans: {mount}"
-    for effects, told in (((), "Nothing to do at the machine."), (("mount_drift",), said)):
+    assert said == f"At the machine, after adding it: {mount}"
+    for effects, told in (((), "Nothing to do at the machine."), (("mount_drift",), f"At the machine: {mount}")):
         added = SimpleNamespace(model=SimpleNamespace(effects=effects))
         assert remedy_at_machine(finding("adequate", linear=added)) == told
 

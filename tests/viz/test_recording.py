@@ -301,6 +301,11 @@ def test_mount_scanner_and_part_are_marked_where_they_err(erring_run, errs, name
     assert marked[1] == name
 
 
+def test_a_link_that_errs_is_marked_between_its_joints(erring_run):
+    svg = machine_svg(erring_run, ("link 4",))
+    assert svg.count('stroke="var(--best)"') == 1 and "var(--best)" not in "".join(circles(svg))
+
+
 def test_suspects_are_marked_with_a_question_and_nothing_moves(erring_run):
     svg = machine_svg(erring_run, ("joint 2", "the robot's base"), suspected=True)
     assert ">2?</text>" in svg and ">base?</text>" in svg and svg.count('stroke-dasharray="5 4"') == 0
