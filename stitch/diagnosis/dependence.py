@@ -26,7 +26,7 @@ FOLLOWS = 0.01
 _AS_WELL = 20.0
 # Columns of which less than this share is new beside the model say nothing; nor does what is smaller than the second.
 _NEW_SHARE, _NOTHING = 1e-4, 1e-9
-# Covariates that correlate but for so little are one.
+# Covariates whose correlation is less than 1 by so little are one.
 _ALIKE = 1e-9
 # Laws of each covariate whose own degrees of freedom of the scatter are asked, the clearest (time).
 _ASKED_OF_EACH = 4
@@ -71,7 +71,7 @@ def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
 def dependences(
     linear: LinearModel, named: Sequence[Ranked] = (), dictionary: Dictionary | None = None
 ) -> tuple[Dependence, ...]:
-    """Find what the displacements of whole views follow, clearest first; () where too few numbers are free.
+    """Return what the displacements of whole views follow, clearest first; () where too few numbers are free.
 
     Args:
         named: effects that are said to be missing: of columns that are one in these views, theirs is listed alone.
@@ -85,10 +85,10 @@ def dependences(
     columns = {k: laws[k].reduced(linear.observation) * laws[k].sizes for k in clearest}
     p_values = np.ones(len(laws))
     p_values[clearest] = _p_values(linear, list(columns.values()))
-    alike = _followed_alike(linear, laws, named)
+    twins = _twins_of_followed(linear, laws, named)
     best: dict[str, int] = {}
     for k in sorted(clearest, key=lambda k: (p_values[k], k)):
-        if laws[k].driver.name not in alike:
+        if laws[k].driver.name not in twins:
             best.setdefault(laws[k].driver.name, k)
     first, *others = best.values()
     beside = dict(
@@ -118,21 +118,31 @@ def _may_be_clearest(linear: LinearModel, laws: Sequence[Law]) -> list[int]:
     return [k for chances in by_driver.values() for _, k in sorted(chances)[:_ASKED_OF_EACH]]
 
 
-def _followed_alike(linear: LinearModel, laws: Sequence[Law], named: Sequence[Ranked]) -> set[str]:
-    """Return covariates that run in these views as one does that a named effect follows, and are not its own."""
-    drivers = {law.driver.name: law.driver.values for law in laws}
-    runs = np.atleast_2d(np.corrcoef(list(drivers.values())))
-    twins = dict(zip(drivers, (np.abs(runs) > 1 - _ALIKE).sum(axis=1) > 1, strict=True))
-    clear = [Span(r.score.form.columns[:, np.abs(r.score.values) > FAINT_SIGMAS * r.score.sigmas]) for r in named]
-    own = {
+def _twins_of_followed(linear: LinearModel, laws: Sequence[Law], named: Sequence[Ranked]) -> set[str]:
+    """Return the covariates that a named effect does not follow, but that correlate fully with one that it does.
+
+    In these views the two are one column: it is listed once, as what the name says.
+
+    Args:
+        laws: whose drivers are the covariates.
+        named: effects that are said to be missing; one follows a covariate if its clear columns contain a law of it.
+    """
+    covariates = {law.driver.name: law.driver.values for law in laws}
+    correlations = np.atleast_2d(np.corrcoef(list(covariates.values())))
+    # Itself is one: more correlate fully where there are twins.
+    full = 1 - _ALIKE
+    has_twin = dict(zip(covariates, (np.abs(correlations) > full).sum(axis=1) > 1, strict=True))
+    named_spans = [Span(r.score.form.columns[:, np.abs(r.score.values) > FAINT_SIGMAS * r.score.sigmas]) for r in named]
+    followed = {
         law.driver.name: law.driver.values
         for law in laws
-        if twins[law.driver.name]
+        if has_twin[law.driver.name]
+        # A joint follows columns of its own alone: j2_torque_nm.
         if law.place.joint is None or law.driver.name.startswith(f"j{law.place.joint}_")
-        if any(of_effect.contains(Span(law.reduced(linear.observation) * law.sizes)) for of_effect in clear)
+        if any(span.contains(Span(law.reduced(linear.observation) * law.sizes)) for span in named_spans)
     }
-    others = {name: x for name, x in drivers.items() if name not in own}
-    return {name for name, x in others.items() if any(abs(np.corrcoef(x, y)[0, 1]) > 1 - _ALIKE for y in own.values())}
+    rest = {name: x for name, x in covariates.items() if name not in followed}
+    return {name for name, x in rest.items() if any(abs(np.corrcoef(x, y)[0, 1]) > full for y in followed.values())}
 
 
 def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:

@@ -312,6 +312,7 @@ class _Effect:
 
 
 def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
+    """Return the effect of a score, its best form fitted to the views beside a linear model."""
     beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
     change = _change(linear, scored.form.columns, beside)
     return _Effect(scored.form.at(change.values), scored.form, change)
@@ -361,10 +362,12 @@ class _Plot:
         return np.einsum("vk,vkp->vp", self.motion.columns, moved) / self.square[:, None]
 
     def trend(self, change: _Change, moves: str, effect: Array) -> EffectTrend:
-        """Return the line of an effect over the dots.
+        """Return the trend of an effect: the dots, with the line that the model would predict with it, and its sigma.
 
         Args:
-            effect: (V,) what it does itself.
+            change: of the model's prediction by the effect, per unit of each parameter.
+            moves: what the effect itself moves: the part, joint 2, …
+            effect: (V,) by how much, in the unit of the motion, whatever hand-eye and effects in use take of it.
         """
         per_unit = self.along(change.per_unit)
         follows, unit, at = self.axis
@@ -387,7 +390,7 @@ class _Plot:
 
 
 def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
-    """Return the dots of a direction: what the model leaves of each view; None where nothing moves along it.
+    """Return the dots of a direction, what the model leaves of each view; None where nothing moves along it.
 
     Args:
         scatter: with the variances of what is independent between views.

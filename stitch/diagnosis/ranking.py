@@ -42,16 +42,16 @@ class Ranked:
 
     @property
     def log_belief(self) -> float:
-        """How often it is met beside a usual effect: a judgement."""
+        """Log prior of the effect over that of a usual one: how often it is met, a judgement."""
         return float(np.log(self.score.candidate.effect.prior))
 
     @property
     def log_evidence(self) -> float:
-        """Log posterior without that judgement: what the views say."""
+        """Log posterior without the judgement of how often the effect is met: what the views say."""
         return self.log_posterior - self.log_belief
 
     def comes_near(self, best: "Ranked") -> bool:
-        """Return whether the views do not take it 20 to 1 behind the best.
+        """Return whether the best is less than 20 to 1 likelier, by the posterior or by what the views alone say.
 
         How often effects are met is a judgement: it orders those that explain as much, and takes none out of them.
         """
@@ -123,7 +123,7 @@ def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: floa
 
 
 def is_contender(ranked: Ranked) -> bool:
-    """Return whether it is significant, more likely than nothing, and seen.
+    """Return whether an effect may be named: physical, shown by these views, significant, and likelier than none.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
     does not know how many were tried.

@@ -105,10 +105,13 @@ def omitted_effect_bias(
 
 
 def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: dict[str, float]) -> float | None:
-    """Return the largest rms (length_unit), along normals, by which a size that does not show bends the scans.
+    """Return how far an effect of the scanner may bend the measured shape without showing: rms along normals.
 
     Scans that err alike agree, and their error becomes the surface. What a motion of each view does too is no shape.
-    None for effects of poses, and without scans.
+    In length_unit, of the parameter that bends it most; None for effects of poses, and without scans.
+
+    Args:
+        detectable: by parameter the smallest size that these views show; where they show none, its plausible size.
     """
     measurement = linear.measurement
     term = candidate.forms[0].term

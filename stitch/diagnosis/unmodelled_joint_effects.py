@@ -108,7 +108,7 @@ class JointEffect:
 
     @cached_property
     def place(self) -> str:
-        """Joint 2, or the base where that follows the same about the same axis."""
+        """Where the effect acts, in words: joint 2, or also the base where that would explain the views as well."""
         kernel = self.errors.kernel_of(self.process)
         error = _given_views(self, kernel, kernel)[0] / self.usual
         motions = self.errors.columns[:, self.process].reshape(len(error), 6)
@@ -365,12 +365,15 @@ def _one_of_two_angles(some: Array, others: Array) -> Array:
 
 
 def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) -> JointCurve:
-    """Return the curve; `variance` (rad²) is that over the views of all that the effect does."""
+    """Return the error of a joint along one covariate, averaged over where all else that it follows stood.
+
+    Args:
+        variance: over the views of all that the effect does, rad²: the curve's share is of this.
+    """
     at = covariate.view_values
     views = len(at)
     grid = np.linspace(at.min(), at.max(), _PLACES)
     places = np.append(grid, at)
-    # Of the function averaged over where all else stood.
     rest = np.broadcast_to(covariate.remaining_kernel, (views, views))
     with_views = rest.mean(axis=0) * covariate.kernel(places, at)
     with_places = rest.mean() * covariate.kernel(places, places)
@@ -390,11 +393,14 @@ def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) ->
 
 
 def _given_views(effect: JointEffect, with_views: Array, prior: Array) -> tuple[Array, Array]:
-    """Return mean (G,) and covariance (G, G) of places of the effect, rad, from what the views show.
+    """Return by how much a joint errs at G places of its curve, given the views: regression of a Gaussian process.
 
     Args:
-        with_views: (G, V) covariance of the places with the effect at the views, per unit of its variance.
-        prior: (G, G) of the places among each other.
+        with_views: (G, V) prior covariance of the error there with that at the views, per unit of its variance.
+        prior: (G, G) prior covariance of the errors there.
+
+    Returns:
+        Mean (G,), rad, and covariance (G, G), rad².
     """
     linear = effect.model
     variance = linear.null.variances[-1]

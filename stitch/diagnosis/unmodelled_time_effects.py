@@ -91,7 +91,7 @@ def time_processes(linear: LinearModel) -> list[SmoothProcess]:
 
 
 def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | None:
-    """Return the likeliest of them beside a model, and the log Bayes factor of all that were tried over all else.
+    """Return the likeliest motion of the flange in time beside a model, and the log Bayes factor of all those tried.
 
     Of each kind of trends one may be there, each kind and each of its trends as likely before: what counts is the mean
     of their Bayes factors. All variances are sought anew for the likeliest few; for the others that is a bound. None
@@ -113,24 +113,29 @@ def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | 
 
 
 def significant_time_effect(linear: LinearModel) -> FittedProcess | None:
-    """Return the likeliest with the log Bayes factor of all that were tried, where it is 20 to 1 likelier than none.
+    """Return the likeliest motion of the flange in time, a swing or a stretch, where it is 20 to 1 likelier than none.
 
-    Beside all else that poses may do; or in place of what wanders: then no less likely than all that wanders, which can
-    do what a stretch does, so that beside it a stretch gains nothing. A swing comes with the likeliest of all periods
-    near its own. As with a joint's effect (`significant_joint_effects`) the odds are those of the likeliest sizes.
+    It is sought beside all else that poses may do, drift included; where nothing stands out there, in place of drift,
+    which can do what a stretch does, so that beside it a stretch gains nothing: then it has to gain at least what drift
+    does. A swing comes with the likeliest of all periods near its own.
+
+    Returns:
+        The motion, with the log Bayes factor of all that were tried, at their likeliest sizes as with a joint's effect
+        (`significant_joint_effects`); None where none is clear.
     """
-    steady, wandering = linear, 0.0
-    likeliest = likeliest_time_effect(linear)
+    base = linear
+    gain_of_drift = 0.0
+    likeliest = likeliest_time_effect(base)
     if likeliest is None or likeliest[1] <= limits.ODDS:
-        steady = linear.without(DRIFT)
-        likeliest = likeliest_time_effect(steady)
-        wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
-        if likeliest is None or likeliest[1] <= max(limits.ODDS, wandering):
+        base = linear.without(DRIFT)
+        likeliest = likeliest_time_effect(base)
+        gain_of_drift = 0.5 * (base.null.deviance - linear.null.deviance)
+        if likeliest is None or likeliest[1] <= max(limits.ODDS, gain_of_drift):
             return None
-    fitted, factor = likeliest
+    fitted, log_bayes_factor = likeliest
     if fitted.process.frequency is not None:
-        fitted = _with_refined_period(steady, fitted)
-    return replace(fitted, log_bayes_factor=factor - wandering)
+        fitted = _with_refined_period(base, fitted)
+    return replace(fitted, log_bayes_factor=log_bayes_factor - gain_of_drift)
 
 
 def unmodelled_log_posterior(base: LinearModel) -> float:
@@ -155,6 +160,7 @@ def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProce
 
 
 def _processes(linear: LinearModel, time: Array, trends: Iterable[_DescribedTrend]) -> list[SmoothProcess]:
+    """Return motions of the flange, in its own frame, that follow these trends over time (V,), in steps."""
     carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return [
         SmoothProcess(None, carried, trend(time), kind, words, trend, frequency)

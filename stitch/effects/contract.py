@@ -281,15 +281,22 @@ def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) 
 
 
 def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
-    """Return a parameter in the session's unit."""
+    """Return a parameter of an argument at zero, with its unit and plausible sizes in the session's length unit.
+
+    Args:
+        key: the argument of the effect's function.
+        spec: what that argument is, with lengths in mm.
+        name: of the parameter.
+        length_unit: of the session.
+    """
     unit, typical, limit = spec.unit, spec.typical, spec.limit
     if spec.kind == "twist" and name.startswith("t"):
         unit, typical, limit = spec.unit_shift, spec.typical_shift, spec.limit_shift
     if spec.kind in ("torque", "moment") and "_" in name[len(key) :].lstrip("_"):
         # A torque between two joints, or a moment of one link, is that of 1 kg there: the coefficient holds its mass.
         unit, typical, limit = f"kg {unit}", _LINK_MASS * typical, _LINK_MASS_LIMIT * limit
-    above, _, below = unit.partition("/")
-    factor = _PER_MM[length_unit] ** ((above == "mm") - (below == "mm"))
+    numerator, _, denominator = unit.partition("/")
+    factor = _PER_MM[length_unit] ** ((numerator == "mm") - (denominator == "mm"))
     return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, spec.grid, argument=key)
 
 
@@ -345,15 +352,9 @@ def effect(
             )
         of_library = (function.__module__ or "").startswith("stitch.effects.")
         known_tier = tier or ("physical" if of_library else "user")
+        needed, used = tuple(needs), tuple(prefers)
         EFFECTS[name] = Effect(
-            name,
-            place,
-            specs,
-            function=function,
-            needs=tuple(needs),
-            prefers=tuple(prefers),
-            tier=known_tier,
-            prior=prior,
+            name, place, specs, function=function, needs=needed, prefers=used, tier=known_tier, prior=prior
         )
         return function
 

@@ -245,13 +245,14 @@ def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) 
         queries = neighbour_queries(c.scans, poses, samples)
 
         def mean_squares(w: int, queries: NeighbourQueries = queries) -> list[float]:
+            """Return the mean square distance (length_unit²) of each other view's samples to view w, in their order."""
             parts = [(v, slice(None)) for v in range(len(queries.scans)) if v != w and len(queries.index[v])]
             if not parts:
                 return []
             _, points, normals = queries.gather(parts)
             distance, facing = queries.search(w, points, normals, limit)
-            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(queries.counts(parts))[:-1])
-            return [float(np.mean(view_squares)) for view_squares in by_view]
+            squares_by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(queries.counts(parts))[:-1])
+            return [float(np.mean(view_squares)) for view_squares in squares_by_view]
 
         squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
     return float(np.sqrt(np.mean(squares)))
@@ -276,6 +277,7 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
         return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
 
     def residual(x: Array) -> Array:
+        """Return what is left (3ΣV,) between each placed centroid and the mean of its capture, reference frame."""
         T = hand_eye(x)
         rows = []
         for c, centroid in zip(captures, centroids, strict=True):

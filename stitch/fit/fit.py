@@ -68,13 +68,13 @@ class FittedRig:
 
     @property
     def captures(self) -> list[Capture]:
-        """Of every session, without the effects in use."""
+        """Captures of the sessions, without the effects in use."""
         if self.correction is not None:
             return list(self.correction.captures)
         return [session.targets.rows.capture for session in self.sessions if session.targets is not None]
 
     def model_of(self, index: int) -> Model:
-        """Of one session: labelled points of an arm share its effects, and each session has its own hand-eye."""
+        """Return the model of session `index`: one for all of scans; of labelled points with a hand-eye of its own."""
         if self.correction is not None:
             return self.correction.model
         targets = self.sessions[index].targets
@@ -82,7 +82,7 @@ class FittedRig:
         return targets.model
 
     def heldout_rms(self, index: int) -> float:
-        """Of one session on views left out, length_unit."""
+        """Return the rms residual of session `index` on views that were left out of the fit, length_unit."""
         if self.correction is not None:
             return self.correction.overlaps[index].gram.rms * self.correction.hand_eye.heldout_ratio
         targets = self.sessions[index].targets

@@ -311,41 +311,46 @@ class _ViewInSlabs:
         self.lock = Lock()
 
     def voxels(self, slab: int) -> tuple[_Voxels, Unsupported]:
-        """Voxels of a slab, and how many of its points support nothing."""
+        """Return the voxels of a slab, and how many of its points support nothing: they are left out.
+
+        Where memory holds the whole scan, its points are averaged by cell, and which of them are kept is known. Else
+        the points of the file are averaged, and each voxel has normal, weight and support of the nearest point in
+        memory; it stands alone where it lies too far from that, or too far off the surface there.
+        """
         axis = self.slabs.axis
         if self.whole is None:
-            every = _place_scan(self.scan, self.T, self.v)
-            inside = self.slabs.of(every.points[:, axis]) == slab
-            keep = inside & self.kept
+            placed_scan = _place_scan(self.scan, self.T, self.v)
+            inside = self.slabs.of(placed_scan.points[:, axis]) == slab
             alone = ~self.kept & ~self.through & inside
             dropped = Unsupported(int(inside.sum()), int(alone.sum()), int((self.through & inside).sum()))
-            kept = every.take(keep)
+            kept = placed_scan.take(inside & self.kept)
             return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
-        in_memory, placed = self._points_in(slab, self.whole)
-        cells = self.slabs.cells(placed)
+        in_memory, columns = self._points_in(slab, self.whole)
+        cells = self.slabs.cells(columns)
         if in_memory is None:
             return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
-        different, at = np.unique(pack_cells(cells, axis), return_inverse=True)
-        count = np.bincount(at, minlength=len(different))
-        mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
+        occupied, voxel_of_point = np.unique(pack_cells(cells, axis), return_inverse=True)
+        count = np.bincount(voxel_of_point, minlength=len(occupied))
+        mean = np.stack([np.bincount(voxel_of_point, x, len(occupied)) for x in columns], axis=1) / count[:, None]
         nearest = self._nearest(mean, count)
         normal = in_memory.normals[nearest]
-        away = mean - in_memory.points[nearest]
-        far = np.einsum("ij,ij->i", away, away)
-        off = np.abs(np.einsum("ij,ij->i", away, normal))
-        del away
-        alone = far > _WITHIN**2 * self.scan.area[nearest]
-        alone |= self.scan.usable[nearest] & (off > _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(far))
+        offset = mean - in_memory.points[nearest]
+        square_distance = np.einsum("ij,ij->i", offset, offset)
+        height = np.abs(np.einsum("ij,ij->i", offset, normal))
+        del offset  # of every point: memory is short here
+        most_height = _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(square_distance)
+        alone = square_distance > _WITHIN**2 * self.scan.area[nearest]
+        alone |= self.scan.usable[nearest] & (height > most_height)
         through = self.through[nearest] & ~alone
         keep = ~(alone | through)
         weight = (count * in_memory.weight[nearest])[keep]
-        voxels = _Voxels(different[keep], weight, mean[keep], normal[keep])
-        return voxels, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
+        voxels = _Voxels(occupied[keep], weight, mean[keep], normal[keep])
+        return voxels, Unsupported(len(voxel_of_point), int(count[alone].sum()), int(count[through].sum()))
 
     def _points_in(self, slab: int, whole: WholeCloud) -> tuple[PlacedPoints | None, list[Array]]:
-        """The view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
+        """Return the view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
 
-        Both in the reference frame, and without the effects.
+        Both in the frame of the slabs, and without the effects. Several slabs are read at a time, and wait here.
         """
         if not self.first <= slab <= self.last:
             return None, [np.zeros(0)] * 3

@@ -184,7 +184,13 @@ def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:
 
 
 def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Array:
-    """(k, k) inverse of what is scaled (k, k) in some units (k,); what nothing shows is zero in it."""
+    """Return the pseudo-inverse (k, k) of a symmetric matrix: zero in the directions that nothing shows.
+
+    Args:
+        scaled: (k, k) matrix·unit·unitᵀ: the matrix in units of its unknowns, in which directions compare.
+        unit: (k,) of each unknown.
+        relative: eigenvalues below this share of the largest count as zero.
+    """
     values, vectors = np.linalg.eigh(scaled)
     shown = np.abs(values) > relative * np.abs(values).max(initial=0.0)
     vectors = vectors[:, shown] * unit[:, None]

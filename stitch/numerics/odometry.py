@@ -154,7 +154,8 @@ def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array,
     pairs = list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
     A, B = motions_between(T_reference_mount, pairs), motions_between(odometry, pairs)
     apart = angle_differences(A, B)
-    kept = np.sort(np.argsort(apart, kind="stable")[: -(-len(pairs) // 2)])
+    half = -(-len(pairs) // 2)  # rounded up
+    kept = np.sort(np.argsort(apart, kind="stable")[:half])
     return A[kept], B[kept]
 
 

@@ -169,7 +169,7 @@ class MixedModel:
 
     @property
     def size(self) -> int:
-        """Numbers in all."""
+        """How many numbers err independently: all of z, unless `independent` says fewer."""
         return int(self.z.size) if self.independent is None else self.independent
 
     def covariance(self, variances: Array) -> Array:
@@ -211,7 +211,10 @@ class FurtherColumns:
         return self.mixed.sums.products_with_further(self.sets)
 
     def in_mean(self) -> MixedModel:
-        """Return the model where they are columns of the free mean as well."""
+        """Return the mixed model with the further columns in its free mean, behind those that it has: A (B, m, a + g).
+
+        Sums over blocks that were made of either are handed on.
+        """
         A = np.concatenate([self.mixed.A, self.G], axis=2)
         if self.mixed.common is None:
             return replace(self.mixed, A=A)

@@ -103,8 +103,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 def _write(folder: Path, session: SessionFiles) -> None:
     folder.mkdir(exist_ok=True)
-    head = {"format": SESSION_FORMAT, "name": session.name}
-    head |= {"length_unit": session.length_unit, "mount": session.mount}
+    head = {"format": SESSION_FORMAT, "name": session.name, "length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
     for name, text in session.texts.items():
         (folder / name).write_text(text, encoding="utf-8")

@@ -73,10 +73,11 @@ def hypotheses_by_surface(capture: Capture, ranked: Sequence[MotionFit]) -> tupl
 
 
 def surface_misfit(capture: Capture, hypothesis: Hypothesis, starts: Sequence[Array]) -> SurfaceFit:
-    """Close in from some hand-eyes (4, 4).
+    """Return how well the views fall together under a hypothesis about the poses, by ICP from some hand-eyes (4, 4).
 
     Args:
         capture: the scans; its own poses do not count.
+        starts: of which the one that ends best is kept.
     """
     posed = replace(capture, T_reference_mount=hypothesis.T_reference_mount)
     if hypothesis.used is not None:
@@ -101,6 +102,13 @@ def fit_centroids(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[f
 
 
 def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
+    """Return per hypothesis the rms (length_unit) and the hand-eye (4, 4) that bring the centroids closest together.
+
+    Levenberg–Marquardt of all hypotheses from all starts at once; a step that makes it worse is not taken.
+
+    Args:
+        centroids: (V, 3) of the scans, scanner frame.
+    """
     count, views = len(tried), len(centroids)
     poses = np.repeat(np.array([h.T_reference_mount for h in tried]), _STARTS, axis=0)
     used = np.ones((count, views))
@@ -128,7 +136,7 @@ def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[floa
 
 
 def _centroid_residual(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
-    """(P, V, 3) placed centroids about their mean."""
+    """Return (P, V, 3) centroids placed by P hand-eyes X, about their mean over the views in use, by their share."""
     placed = frames.transform(poses @ X[:, None], centroids[None, :, None])[:, :, 0]
     return placed - np.einsum("pv,pvi->pi", share, placed)[:, None]
 

@@ -371,11 +371,12 @@ def _other_orders(R: Rotation) -> Iterator[tuple[str, Rotation, dict[str, str]]]
 
 
 def _order_name(order: str) -> str:
+    """Return an order of Euler angles in words: xyz-intrinsic, zyx-extrinsic."""
     return f"{order.lower()}-{'intrinsic' if order.isupper() else 'extrinsic'}"
 
 
 def euler_angles(R: Rotation, order: str) -> Array:
-    """Return angles (V, 3) in an order, rad."""
+    """Return Euler angles (V, 3), rad, in an order as SciPy has it: "XYZ" about moving axes, "xyz" about fixed ones."""
     with warnings.catch_warnings():
         # Gimbal lock sets an angle to zero: that reading is one of those to try.
         warnings.simplefilter("ignore")

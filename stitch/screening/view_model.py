@@ -337,17 +337,17 @@ class UsualEffects:
     model: Model
 
     def twists(self, unconstrained: UnconstrainedPoses) -> Array:
-        """Left twists of the views about the centre of the correspondences, one column a parameter, at its deviation.
+        """Return what effects do to the views: left twists (6V, P), a column for each parameter at its usual deviation.
 
-        Returns:
-            (6V, P) twists, reference frame, rad and length_unit.
+        About the centre of the correspondences; reference frame, rad and length_unit.
         """
         return _TIMES_USUAL * np.hstack(list(self.by_place(unconstrained).values()))
 
     def errors(self, unconstrained: UnconstrainedPoses) -> PoseErrors:
-        """The same in sizes that the views show, one for every place of the chain, beside all that arms do.
+        """Return the pose errors of a good session: those of arms, and effects, with a variance for each place.
 
-        Mount and part also wander as slowly as a session is long: they warm up, creep or settle by no law.
+        How large each is, the views show. Mount and part also wander as slowly as a session is long: they warm up,
+        creep or settle by no law.
         """
         capture = self.measurement.capture
         centre = unconstrained.overlaps.gram.centre
@@ -363,10 +363,14 @@ class UsualEffects:
         return errors
 
     def by_place(self, unconstrained: UnconstrainedPoses, without: Collection[str] = ()) -> dict[str, Array]:
-        """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size.
+        """Return by place of the chain (robot, mount, part, …) what its effects do to the views.
 
         Args:
             without: names of effects that do not count.
+
+        Returns:
+            Left twists (6V, P) about the centre of the correspondences, a column for each parameter of plausible size;
+            reference frame, rad and length_unit.
         """
         # Steps between two views are tested as blocks of views.
         possible = [

@@ -288,8 +288,11 @@ def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> 
 def _fit_quadrics(
     points: Array, own: Array, normals: Array, index: Indices
 ) -> tuple[Array, Array, Callable[[], Array]]:
-    """What quadrics of k neighbours leave along normals (k, N), their normals at the points (N, 3), and a function
-    for how many numbers (N,) each took.
+    """Return what quadrics through N points leave of their k neighbours, and how they bend.
+
+    Returns:
+        Distances (k, N) from the quadrics along the normals, length_unit; unit normals (N, 3) of the quadrics at the
+        points; and a function that returns how many numbers (N,) each quadric took.
 
     With c the coefficients of x, y, x², √2·xy, y², S their normal matrix beside a constant and W its blocks of first
     and of second order without: c = (S + μW)⁻¹q, and again for what is left (iterated Tikhonov).
@@ -329,7 +332,7 @@ def _fit_quadrics(
 
 
 def _normal_matrices(terms: Array) -> Array:
-    """Return (m, m, N) of terms (m, k, N)."""
+    """Return N normal matrices (m, m, N): the products of every two of m terms (m, k, N), summed over k neighbours."""
     out = np.empty((len(terms), *terms[:, 0].shape))
     for i, term in enumerate(terms):
         out[i, : i + 1] = out[: i + 1, i] = np.einsum("kn,jkn->jn", term, terms[: i + 1])

@@ -112,6 +112,14 @@ def _recover(home: Path, path: Path) -> None:
 
 
 def _commit(scratch: Path, path: Path, ours: Ours) -> None:
+    """Put a scratch folder in the place of `path`; whoever is killed meanwhile leaves the old one or the new.
+
+    Files that are not ours stay. A scratch folder inside `path` first says which files go, and is renamed: from then on
+    it counts (`_recover` finishes it). One beside `path` takes over what is not ours, and changes places with it.
+
+    Args:
+        ours: whether a file, by its path inside `path`, is one that we write.
+    """
     if scratch.parent == path:
         goes = [str(f.relative_to(path)) for f in _list_files(path) if ours(f.relative_to(path))]
         (scratch / _GOES).write_text(json.dumps(goes), encoding="utf-8")
@@ -132,7 +140,7 @@ def _commit(scratch: Path, path: Path, ours: Ours) -> None:
 
 
 def _finish_commit(path: Path) -> None:
-    """What was committed takes its place; done twice it does the same."""
+    """Delete what a commit inside `path` says that goes, and move its files to their places; twice does the same."""
     commit = path / _COMMIT
     new = {file.relative_to(commit) for file in _list_files(commit)} - {Path(_GOES)}
     if (commit / _GOES).is_file():
@@ -158,6 +166,7 @@ def _list_files(folder: Path) -> Iterator[Path]:
 
 
 def _preserve_file(file: Path, place: Path) -> None:
+    """Make `place` the same file, link or empty folder as `file`: linked where the file system can, else copied."""
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir() and not file.is_symlink():
         place.mkdir(exist_ok=True)

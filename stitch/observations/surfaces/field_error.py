@@ -170,11 +170,15 @@ def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
 
 
 def _follows_time(errors: Array, alpha: float) -> bool:
-    """Return whether errors of the views, part after part, follow their order more than other orders would have it."""
-    parts = len(errors) // COARSE
-    errors = errors.reshape(parts, -1)
-    order = np.arange(parts) - (parts - 1) / 2
-    generator = np.random.default_rng(parts)
+    """Return whether smooth errors of single views trend with their order: a permutation test at level `alpha`.
+
+    Args:
+        errors: coefficients of the errors, `COARSE` of each view, one view after the other.
+    """
+    views = len(errors) // COARSE
+    errors = errors.reshape(views, -1)
+    order = np.arange(views) - (views - 1) / 2
+    generator = np.random.default_rng(views)
     others = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
     trend = np.linalg.norm(order @ errors)
     return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS) < alpha)

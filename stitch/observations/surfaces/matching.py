@@ -76,7 +76,7 @@ def overlap_shares(
         asking[w].append(v)
 
     def meeting(asked: tuple[int, list[int]]) -> list[float]:
-        """Return the shares of the views that ask one view."""
+        """Return for each view that asks one view, (w, views), the share of its points that find a partner there."""
         w, views = asked
         parts = [(v, slice(None)) for v in views]
         _, points, normals = queries.gather(parts)
@@ -116,7 +116,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Nearest:
-    """What N points found in one view."""
+    """The partners that N points of other views have in one view."""
 
     partner: NDArray[np.int32]  # (N,) usable point of the view; -1 where none lies within reach
     lead: Array  # (N,) float32: with less than half of it as motion no other point comes nearer within the gate
@@ -124,7 +124,7 @@ class Nearest:
 
 @dataclass(frozen=True)
 class Searched:
-    """What the points of all views found in the others, so that after little motion few have to look again."""
+    """The partners of the points of all views, kept so that after little motion few have to be searched again."""
 
     queries: "NeighbourQueries"
     parts: list[list[QueryPart]]  # per view those that ask it
@@ -134,9 +134,18 @@ class Searched:
     def still_open(
         self, queries: "NeighbourQueries", parts: list[list[QueryPart]], gate: float
     ) -> list[Indices] | None:
-        """Return per view asked the queries that under new poses may have another partner; None: ask all anew.
+        """Return per view asked which of its queries (indices) may have another partner under new poses.
 
-        Distances change by no more than the motion of the point that asks, seen from the view that is asked.
+        A distance changes by no more than the motion of the point that asks, seen from the view that is asked: a
+        partner that leads by more than twice that motion is still the nearest.
+
+        Args:
+            queries: of the same points under the new poses.
+            parts: per view those that ask it.
+            gate: largest distance between partners, length_unit.
+
+        Returns:
+            None where all have to ask anew: other points, a larger gate, or motions that leave little known.
         """
         before = self.queries
         if gate > self.gate or parts != self.parts or len(queries.scans) != len(before.scans):

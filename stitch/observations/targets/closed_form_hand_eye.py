@@ -93,9 +93,8 @@ class _PointEquations:
         off = s.points[v, slot] - self.offset
         self.scale = float(np.linalg.norm(off, axis=1).mean()) or 1.0
         self.p = off / self.scale
-        target: Indices = s.target[v, slot]
-        self.target = target
-        self.of_target = csr_matrix((np.ones(len(target)), (target, np.arange(len(target)))))
+        self.target: Indices = s.target[v, slot]
+        self.of_target = csr_matrix((np.ones(len(self.target)), (self.target, np.arange(len(self.target)))))
 
     def linear_starts(self) -> list[Array]:
         """Return rotations (3, 3) of the linear system, |vec R| imposed and not; those that are near none only alone.

@@ -54,7 +54,11 @@ class Outlier(Value):
 
 
 def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
-    """The worst of every view that is off, one target at a time, under a fitted model.
+    """Return one outlier of every view that has some, under a fitted model: its worst target, or else all of it.
+
+    Each view is measured three ways, by multiples of the median over these data: how far a target lies from where the
+    rest of its view has it, how badly all its targets fit each other wherever the view stands, and how far they lie
+    from the model.
 
     Args:
         variances: (3,) of rotation scatter, translation scatter, factor on the sensor's noise.
@@ -63,36 +67,41 @@ def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
     assert sightings is not None
     V, S = sightings.used.shape
     mixed = rows.mixed_model(rows.hand_eye)
-    left = rows.residual[:V]
-    P = np.linalg.inv(mixed.covariance(variances)[:V]).astype(float)
-    free = np.linalg.inv(mixed.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
+    residual = rows.residual[:V]
+    precision = np.linalg.inv(mixed.covariance(variances)[:V]).astype(float)
+    precision_anywhere = np.linalg.inv(mixed.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
     seen = sightings.used.any(axis=1)
-    slots, apart = _slot_deviations(P, left, S)
-    slots[~sightings.used] = np.nan
-    misfit = np.where(seen, np.sqrt(np.maximum(np.einsum("vi,vij,vj->v", left, free, left), 0.0)), np.nan)
+    deviation, distance = _slot_deviations(precision, residual, S)
+    deviation[~sightings.used] = np.nan
+    squares = np.einsum("vi,vij,vj->v", residual, precision_anywhere, residual)
+    misfit = np.where(seen, np.sqrt(np.maximum(squares, 0.0)), np.nan)
     distances = rows.distances(rows.residual)
-    off = np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(sightings.used.sum(axis=1), 1))
-    off[~seen] = np.nan
-    slots, misfit, far = (x / max(float(np.nanmedian(x)), 1e-300) for x in (slots, misfit, off))
+    view_rms = np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(sightings.used.sum(axis=1), 1))
+    view_rms[~seen] = np.nan
+    deviation, misfit, view_times = (x / max(float(np.nanmedian(x)), 1e-300) for x in (deviation, misfit, view_rms))
     several = sightings.used.sum(axis=1) > 1
-    out = []
+    outliers = []
     for v in np.flatnonzero(seen):
-        slot = int(np.nanargmax(slots[v]))
-        if several[v] and misfit[v] > LIMIT_TARGET and slots[v, slot] > LIMIT_TARGET:
+        slot = int(np.nanargmax(deviation[v]))
+        if several[v] and misfit[v] > LIMIT_TARGET and deviation[v, slot] > LIMIT_TARGET:
             name = sightings.targets[sightings.target[v, slot]]
-            out.append(Outlier(int(v), name, float(apart[v, slot]), float(slots[v, slot])))
-        elif far[v] > LIMIT_VIEW:
-            out.append(Outlier(int(v), None, float(off[v]), float(far[v])))
-    return out
+            outliers.append(Outlier(int(v), name, float(distance[v, slot]), float(deviation[v, slot])))
+        elif view_times[v] > LIMIT_VIEW:
+            outliers.append(Outlier(int(v), None, float(view_rms[v]), float(view_times[v])))
+    return outliers
 
 
-def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
-    """(V, S) of each target from what the rest of its view foretells, in sigmas and in length_unit.
+def _slot_deviations(P: Array, residual: Array, slots: int) -> tuple[Array, Array]:
+    """Return how far targets lie from where the rest of their view foretells them, (V, S) in sigmas and in length_unit.
 
-    With P the inverse covariance of a view, that deviation is P_ss⁻¹ (P e)_s with covariance P_ss⁻¹.
+    With P the inverse covariance of a view's residuals e, that deviation is P_ss⁻¹ (P e)_s with covariance P_ss⁻¹.
+
+    Args:
+        P: (V, m, m).
+        residual: (V, m) of which the first 3S are coordinates, of each target after the other.
     """
     V = len(P)
-    pushed = np.einsum("vij,vj->vi", P, left)[:, : 3 * slots].reshape(V, slots, 3)
+    pushed = np.einsum("vij,vj->vi", P, residual)[:, : 3 * slots].reshape(V, slots, 3)
     blocks = P[:, : 3 * slots, : 3 * slots].reshape(V, slots, 3, slots, 3)
     blocks = np.moveaxis(blocks[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # (V, S, 3, 3)
     apart = np.einsum("vsij,vsj->vsi", np.linalg.inv(blocks), pushed)

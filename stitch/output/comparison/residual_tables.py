@@ -312,6 +312,10 @@ class _CorrespondenceRows:
     """Both sides of every correspondence inside the robust gate."""
 
     def __init__(self, state: RunData, poses: Array, matches: Sequence[Match], scale: float) -> None:
+        """Take apart the matches of V views at poses (V, 4, 4); `scale` is the robust sigma of their distances.
+
+        Each correspondence has two rows: of v with partner w, and of w with partner v and the other sign.
+        """
         self.count = len(poses)
         parts: list[list[Array]] = [[], [], [], [], [], []]
         for m in matches:
@@ -352,6 +356,7 @@ class _OffsetRows:
     """Labelled points in views: where a view puts each, less where hand-eye and effects put it best."""
 
     def __init__(self, state: RunData) -> None:
+        """Fit the places of the targets under the model of a run, and take what is left as offsets."""
         capture = corrected_capture(state.measurement, state.model)
         sightings = capture.sightings
         assert sightings is not None
@@ -384,21 +389,23 @@ class _OffsetRows:
 
 
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
-    """Return the table of views, one sample each: how well its own mean is known nothing says."""
+    """Return the table of views; each is one sample, so that nothing says how well its mean is known (NaN)."""
     table = _labelled_table("view", names, rows.statistics(rows.view, len(names)))
     nothing = np.full(len(names), np.nan)
     return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
 
 
 def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
-    n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
-    v, w = np.nonzero(np.triu(n, 1))
-    count = n[v, w]
+    """Return the table of pairs of views that have correspondences; a pair is one sample, without a sigma (NaN)."""
+    one_bin = np.zeros(len(rows.view), np.int64)
+    counts, sums, squares = (by_bin[0] for by_bin in rows.sums(one_bin, 1))
+    v, w = np.nonzero(np.triu(counts, 1))
+    count = counts[v, w]
     nothing = np.full(len(v), np.nan)
     statistics = BinStatistics(
-        mean=s[v, w] / count,
+        mean=sums[v, w] / count,
         mean_sigma=nothing,
-        rms=np.sqrt(q[v, w] / count),
+        rms=np.sqrt(squares[v, w] / count),
         rms_sigma=nothing,
         count=count,
         views=np.full(len(v), 2),

@@ -62,7 +62,10 @@ def require_las_room(path: Path) -> None:
 
 
 def require_e57_room(path: Path) -> None:
-    """Refuse an E57 one of whose scans announces more points than it can hold; see `require_room`."""
+    """Refuse an E57 one of whose scans announces more points than it can hold; see `require_room`.
+
+    The XML that describes the scans lies in pages of the file, each of which ends with a checksum.
+    """
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(_E57_HEADER)

@@ -88,10 +88,9 @@ def _exr(path: Path) -> Array:
     if all(axis in channels for axis in "XYZ"):
         return np.dstack([channels[axis] for axis in "XYZ"])
     name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
-    several = channels[name].ndim == 3 and np.ptp(channels[name][..., :3], axis=2).any()
-    return (
-        channels[name][..., :3] if several else channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
-    )
+    pixels = channels[name]
+    is_colour = pixels.ndim == 3 and np.ptp(pixels[..., :3], axis=2).any()
+    return pixels[..., :3] if is_colour else pixels if pixels.ndim == 2 else pixels[..., 0]
 
 
 def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:

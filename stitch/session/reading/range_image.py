@@ -57,6 +57,10 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
 
 
 def _read_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
+    """Return points (H, W, 3) in the file's unit and brightness (H, W) of a file that holds an image.
+
+    None for the points of another file; None for a brightness that it does not hold.
+    """
     kind = path.suffix.lower()
     if kind in DEPTH_SUFFIXES or (kind == ".npy" and is_depth_image(path)):
         return read_depth(path), None
@@ -77,14 +81,18 @@ def _read_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
 
 
 def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) -> dict[str, Array]:
-    """The vertices on their grid, where the file lists the measured ones and says which pixel has which."""
+    """Return columns (H·W,) of a PLY, a value for each pixel of its grid (H, W); NaN and 0 where none was measured.
+
+    Unchanged where they have as many rows as pixels already, or where no list says which pixel has which vertex.
+    """
     if len(columns["x"]) == shape[0] * shape[1]:
         return columns
     pixels = ply_file.read_ply(path).get("range_grid", {}).get("vertex_indices")
     if not isinstance(pixels, ply_file.Lists):
         return columns
     index = np.full(len(pixels.lengths), -1)
-    index[pixels.lengths > 0] = pixels.values[(np.cumsum(pixels.lengths) - pixels.lengths)[pixels.lengths > 0]]
+    measured = pixels.lengths > 0
+    index[measured] = pixels.values[(np.cumsum(pixels.lengths) - pixels.lengths)[measured]]
     return {
         name: np.where(index >= 0, np.asarray(column, float)[index], np.nan if name in "xyz" else 0.0)
         for name, column in columns.items()
@@ -104,6 +112,7 @@ def _array_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
 
 
 def _brightness_of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | None:
+    """Return the brightness (N,) of points by their colours or a grey column (N,); None without either."""
     for names in _RGB:
         if all(name in columns for name in names):
             return _grey(np.array([columns[name] for name in names], float))
@@ -118,7 +127,10 @@ def _brightness_of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | Non
 
 
 def _grey(channels: Array) -> NDArray[np.uint8]:
-    """Brightness of one channel or of three (c, …); counts beyond 8 bits are scaled to their brightest."""
+    """Return the brightness of one channel or of three (c, …), 0 to 255.
+
+    Values from 0 to 1, and counts of more than 8 bits, are scaled so that nearly the brightest is 255.
+    """
     values = np.nan_to_num(channels.mean(axis=0))
     top = float(np.percentile(values, 100 - _SATURATED)) if values.size else 0.0
     white = 255.0 if 1.0 < top <= 255.0 else max(top, 1e-12)

@@ -116,7 +116,16 @@ def _length_text(size_m: float) -> str:
 
 
 def _compare_motions(session: SessionData, flange: Array) -> None:
-    """Labelled points have no size of their own, but a target that several views see moves with the arm."""
+    """Refuse labelled points that move much more or less than the arm does, so that the unit of one looks wrong.
+
+    They have no size of their own, but a target that several views see moves with the arm.
+
+    Args:
+        flange: (V, 3) positions of the flange, m.
+
+    Raises:
+        ScaleError: they do.
+    """
     sightings = [view.sighting for view in session.views if view.sighting is not None]
     if len(sightings) < 3 or session.has_clouds:
         return
@@ -134,7 +143,11 @@ def _compare_motions(session: SessionData, flange: Array) -> None:
 
 
 def _compare_standoff(session: SessionData, cloud_unit: str) -> None:
-    """Against the working distance that the session itself states."""
+    """Refuse scans whose size or distance contradicts the working distance that session.toml states.
+
+    Raises:
+        ScaleError: they do: one of the two looks off by a factor of 1000.
+    """
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     standoff = session.scanner.standoff
     if not clouds or not standoff:
