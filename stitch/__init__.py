@@ -43,6 +43,7 @@ _CORE = {
 
 
 def __getattr__(name: str) -> Any:
+    """Return a public name, whose module is loaded now: `import stitch` alone takes no time."""
     if name in _CORE:
         return getattr(import_module(_CORE[name]), name)
     if name == "MODULES":

@@ -131,6 +131,7 @@ class LiveSession:
     def __init__(
         self, session: Session, recording: LiveRecording | None = None, cloud_unit: LengthUnit | None = None
     ) -> None:
+        """Begin with the views that the session has; `cloud_unit` is that of clouds which are given as arrays."""
         self.session = session  # with the views so far
         self.said: list[LiveView] = []  # of every view, in their order
         self._recording = recording
@@ -217,6 +218,11 @@ class LiveSession:
         return self._take(view, time.perf_counter())
 
     def _take(self, view: View, began: float) -> LiveView:
+        """Judge one more view, remember and show what is said of it; after an error the session is as it was before.
+
+        Args:
+            began: `time.perf_counter` at the call, from which the seconds count.
+        """
         with self._lock:
             before = (self.session, self._fit, self._members, self._drawn)
             count = len(self.said)
@@ -289,6 +295,12 @@ class LiveSession:
         return view
 
     def _judge(self, view: View) -> LiveView:
+        """Return what is said of the last view of the session, and put it into the fit if it belongs.
+
+        A copy is asked for first, since a scan that is there twice fits itself. Then the view is placed by its surface,
+        and all views are tested with it: others may turn out not to belong, and leave the fit. Last, what U gains says
+        if it adds much.
+        """
         original = self._original_of(view)
         if original is not None:
             same = np.allclose(original.T_base_flange, view.T_base_flange, rtol=0.0, atol=1e-9)
@@ -404,6 +416,11 @@ class LiveSession:
     def _errors(
         self, capture: Capture, freed: UnconstrainedPoses, T_mount: Array
     ) -> tuple[PoseErrors, dict[str, list[Array]]]:
+        """Return usual errors of poses and of scanners for the views in the fit.
+
+        Args:
+            T_mount: (4, 4) hand-eye so far.
+        """
         measurement = measurement_of(self._session_of(self._members), capture)
         errors = prior_pose_errors([measurement], Model(T_mount), [freed.overlaps.gram.centre])
         return errors, rig_scanner_errors([measurement], [freed])
@@ -478,6 +495,11 @@ def follow(session: SessionData) -> LiveSession:
 
 
 def _recording(session: Session, target: str) -> LiveRecording:
+    """Return a recording that shows a live session at `target`, of the first package that offers one (entry points).
+
+    Raises:
+        InputError: none does.
+    """
     entry = next(iter(entry_points(group="stitch.live_recordings")), None)
     if entry is None:
         raise InputError("recording: nothing here shows it; to fix: install rerun-sdk, or leave recording out")

@@ -328,6 +328,7 @@ def require_effects(measurements: Sequence[Measurement], effects: Sequence[str])
 def _show_coarse_stage(
     session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
 ) -> StageResult:
+    """Return the stage of the coarse hand-eye, which took so many seconds, after showing it to a recorder."""
     stage = coarse_stage(session, measurement, start, seconds)
     recorder.stage(stage, measurement.capture.poses(start.T_mount))
     return stage
@@ -358,6 +359,12 @@ class _Conductor:
         recorders: Sequence[Recorder],
         register: str,
     ) -> None:
+        """Take what the steps of a run begin with, of every session in their order.
+
+        Args:
+            coarse: stages of the coarse hand-eye, by session.
+            register: method.
+        """
         self._sessions = sessions
         self._start = start
         self._coarse = coarse

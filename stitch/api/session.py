@@ -342,6 +342,7 @@ def _measured_views(cell: Session, names: list[str], scans: list[Any], points: A
     scale = METRES[cloud_unit] / metres
 
     def cloud(at: int) -> Cloud | None:
+        """Return the checked cloud of one view, None where it has no scan."""
         if scans[at] is None:
             return None
         where = f"view {names[at]}"

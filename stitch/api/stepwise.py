@@ -103,6 +103,8 @@ def suggest(
 
 
 def _finding_of(diagnosis: Diagnosis) -> Finding:
+    """Return what a diagnosis says in sentences, with what it says of several sessions and of views left out."""
+
     from stitch.diagnosis.diagnosis import Finding
 
     notes = (f"{note}." for note in diagnosis.notes if note not in diagnosis.sentence)

@@ -192,6 +192,8 @@ def _show_unchanged(run: Path, as_json: bool) -> None:
 
 
 def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
+    """Print the report of a changed run and which others of its rig were left as they were, or its result as JSON."""
+
     from stitch.cli.run import show_report
     from stitch.output.json_file import others_of_rig, to_json
     from stitch.output.result_document import result_document

@@ -42,6 +42,7 @@ class Commands(Mapping[str, Any]):
     """Name to command, loaded at first use."""
 
     def __init__(self) -> None:
+        """List the commands of the core and of installed packages, the usual ones first; a package may replace one."""
         core = [EntryPoint(name, place, GROUP) for name, place in _CORE_COMMANDS.items()]
         entries = {entry.name: entry for entry in (*core, *entry_points(group=GROUP))}
         first = [name for name in _ORDER if name in entries]

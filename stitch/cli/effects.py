@@ -57,6 +57,7 @@ def parameter_signature(effect: Effect) -> str:
 
 
 def _document(effect: Effect) -> dict[str, Any]:
+    """Return an effect as JSON has it: place, formula, parameters with units and plausible sizes, and what it needs."""
     return {
         "effect": effect.name,
         "place": effect.place,
@@ -79,6 +80,8 @@ def _document(effect: Effect) -> dict[str, Any]:
 
 
 def _show_effect(effect: Effect) -> None:
+    """Print an effect: its place and formula, a line for each parameter with its plausible size, and what it needs."""
+
     from stitch.effects.contract import PLACES
 
     kinds = {

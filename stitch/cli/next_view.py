@@ -124,6 +124,12 @@ def show_next_views(diagnosis: Diagnosis, document: dict[str, Any]) -> None:
 
 
 def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[str, Any]) -> None:
+    """Print the views that decide between effects, with the odds, and by how much each effect would move the first one.
+
+    Args:
+        document: diagnosis.json, which holds what is expected of the first view.
+    """
+
     from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
     from stitch.numerics.units import angle_text, length_text
 
@@ -151,6 +157,8 @@ def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[s
 
 
 def _why_nothing(diagnosis: Diagnosis) -> str:
+    """Return why no view is proposed, in a sentence."""
+
     from stitch.diagnosis.thresholds import ALIAS_CORRELATION
 
     effects = diagnosis.effects

@@ -78,6 +78,7 @@ class LiveLine:
     """
 
     def __init__(self) -> None:
+        """Begin with an empty line: nothing is shown before the first text."""
         self._status: Any = None
         self._visible = False
         self._step = self._detail = ""

@@ -189,6 +189,7 @@ def speak_any_terminal() -> None:
 
 
 def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
+    """Return plain letters for those that an encoding lacks, and where to go on (`codecs.register_error`)."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     text = ""

@@ -139,6 +139,11 @@ def free_masks(term: Term) -> list[Mask]:
 
 
 def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
+    """Return the candidate of terms of one effect, a term for each value of its grid; None where nothing is free in it.
+
+    Args:
+        responses: of the observation to the parameters of each term.
+    """
     forms = list[Form]()
     for term, response in zip(terms, responses, strict=True):
         reduced = linear.reduce(response.columns)

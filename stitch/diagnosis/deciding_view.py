@@ -362,6 +362,7 @@ class _FurtherScans:
 
     @classmethod
     def of(cls, linear: LinearModel, surfaces: SurfaceObservation, joints: Array, wait: Array) -> "_FurtherScans":
+        """Return further views at joint angles (N, J), rad, after waits (N,), s, beside those of a linear model."""
         further = candidate_measurement(linear.measurement, joints, wait)
         every = with_candidates(linear.measurement, further)
         errors = None
@@ -429,6 +430,16 @@ def _with_drift(errors: PoseErrors, every: Measurement, before: Measurement, cen
 
 
 def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _FurtherScans) -> Prediction:
+    """Return what further views would show of their poses if an effect, as these views fit it, were there.
+
+    Args:
+        scored: the effect, or a joint that errs without a name.
+        scans: the further views, beside those that there are.
+
+    Returns:
+        Mean (N, 6) of the left twists of the further views about the centre, how it answers to what is unknown,
+        covariance that the views share, that of each alone, and how they answer to hand-eye and effects in use.
+    """
     unnamed = scored if isinstance(scored, JointEffect) else None
     base = scored.model if isinstance(scored, JointEffect) else model_beside(linear, scored)
     measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre

@@ -52,6 +52,11 @@ def linear_model_of(state: RunData) -> LinearModel:
 
 
 def _diagnose(state: RunData) -> Diagnosis:
+    """Return the diagnosis of a run: which effect is missing, if one is, what else could be, and whence the rest comes.
+
+    First the evidence decides the verdict; then every candidate is described; then errors without a name are sought,
+    since what is said of the scatter depends on them.
+    """
     announce("diagnosing: what every view tells of its pose")
     linear = linear_model_of(state)
     limit = scatter_limit(state.session)
@@ -126,6 +131,7 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
     response = hand_eye_response(linear)
 
     def examined(k: int) -> CandidateEffect:
+        """Return candidate k with aliases, smallest detectable sizes, and what it does to hand-eye and shape unseen."""
         scored = scores[k]
         detectable = detectable_sizes(linear, scored.candidate, tests)
         validation = evidence.left_out.get(scored.name)

@@ -73,6 +73,11 @@ def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: S
 
 
 def propose(case: Case, limit: ScatterLimit) -> Evidence:
+    """Return the evidence after the questions that lead to a name, which nothing has been held against yet.
+
+    Args:
+        limit: what the poses of an arm may scatter.
+    """
     ranked, empirical = rank_all(case.linear, case.candidates)
     laws = rank_laws(case.linear, case.dictionary)
     evidence = Evidence(

@@ -417,6 +417,12 @@ class LawEffect(Effect):
 
 
 def _fitted(linear: LinearModel, law: Law, start: Array, scale: float) -> tuple[Candidate, Score]:
+    """Return a law as a candidate, and its score beside the null.
+
+    Args:
+        start: (c,) variances to begin with.
+        scale: of its plausible sizes, the likeliest.
+    """
     reduced = law.reduced(linear.observation)
     k = reduced.shape[1] // len(law.columns)
     units = [unit for unit in np.array(law.place.units)[law.columns] for _ in range(k)]

@@ -298,6 +298,7 @@ def least_log_bayes_factor(linear: LinearModel, scored: Score) -> tuple[float, s
     where pose errors have a prior."""
 
     def factor_beside(trend: FittedProcess) -> float:
+        """Return the log Bayes factor of the effect beside a trend, at the likelier of the sizes that that may have."""
         both = linear.in_blocks(np.hstack([trend.columns, scored.form.columns]))
         size = np.full(trend.columns.shape[1], trend.size)
         priors = [np.append(times * size, scored.sizes) for times in limits.TREND_SIZES]

@@ -341,6 +341,7 @@ def effect(
         raise InputError(f"effect at {place!r}: places are {', '.join(PLACES)}")
 
     def register(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Put a function into the library as an effect, and return it unchanged."""
         name = function.__name__
         if name in EFFECTS and EFFECTS[name].tier != "user":
             raise InputError(f"effect {name!r} is in the library already; give yours another name")

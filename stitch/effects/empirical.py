@@ -42,6 +42,8 @@ def _effect(
 
 
 def _bias(name: str, order: int, shape: Array) -> Effect:
+    """Return the effect of a bias along the ray that follows `shape` (N,): a Legendre polynomial of this order."""
+
     def bias(points: Array, view: ScanView, k: float) -> Array:
         return points + view.along(points) * (k * shape[view.index])
 

@@ -129,6 +129,7 @@ def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
 
     @wraps(effect.function)
     def function(*arguments: Any, **parameters: Any) -> Any:
+        """Call the effect on arrays that it may not write into, and return its result once that is checked."""
         # An effect returns what changes and leaves what it is given.
         views = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
         for value in views:
@@ -207,6 +208,7 @@ def _name_errors(path: Path, what: str) -> Iterator[None]:
 
 
 def _seconds() -> float:
+    """Return after how many seconds a call of a user's effect is ended, as the environment or else the default says."""
     try:
         seconds = float(os.environ.get(_LIMIT, _SECONDS))
     except ValueError:

@@ -117,6 +117,7 @@ def _require_installed(module: ModuleType, name: str, where: str) -> None:
 
 
 def _require_literal(name: str, value: Any, where: str) -> None:
+    """Refuse a value, used by a user's effect under a name, that Python source cannot spell."""
     try:
         same = bool(ast.literal_eval(repr(value)) == value)
     except (ValueError, SyntaxError, TypeError):

@@ -103,6 +103,7 @@ class _Motions:
         size = 3 + 6 * K
 
         def shifts(x: Array) -> Array:
+            """Return what is left (3P,) of the shifts between views that the scanner saw, for unknown positions x."""
             placed = self._shifted(directions, x)
             pose = placed @ frames.make(R_mount, x[:3])
             first, second = pose[self.pairs[use, 0]], pose[self.pairs[use, 1]]
@@ -250,7 +251,11 @@ def _turn(R: Array) -> Array:
 
 
 def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:
-    """Return them after least squares of all angles between motions, wrong ones counting little."""
+    """Return directions (K, 3) and R_mount after least squares of all angles between motions; wrong ones count little.
+
+    Args:
+        wanted: numbers of the axes whose directions are sought; the others stay.
+    """
 
     def moved(x: Array) -> tuple[Array, Array]:
         turned = directions.copy()

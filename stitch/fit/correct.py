@@ -151,6 +151,11 @@ def correct(
 
 
 def _check_distance(captures: Sequence[Capture], T_mount: Array) -> None:
+    """Refuse a hand-eye whose scanner lies implausibly far from the flange: the fit has run away.
+
+    Raises:
+        NoResultError: it does.
+    """
     if not np.linalg.norm(T_mount[:3, 3]) < _FARTHEST * part_size(captures):
         raise NoResultError(
             "these views hold the hand-eye nowhere: what the scans show hardly follows the poses; to fix: check that "

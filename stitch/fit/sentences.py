@@ -112,6 +112,7 @@ def target_sentence(targets: TargetModelFit, registered: float, scatter: Repeata
 
 
 def _scatter_sentences(scatter: Repeatability, registered: float, length_unit: str) -> str:
+    """Return how far the poses scatter, and the rms that register leaves (`registered`, length_unit), in sentences."""
     return (
         f"The robot's poses scatter by {length_text(scatter.translation, length_unit)} and "
         f"{angle_text(scatter.rotation, 2)}. After each view got its own correction, "
@@ -223,6 +224,7 @@ def mixed_notes(targets: TargetModelFit, outliers: Sequence[Outlier], session: S
 
 
 def _unused_points(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> list[str]:
+    """Return notes on labelled points that do not count: outliers, and targets that only one view sees."""
     notes = []
     if outliers:
         named_outliers = [

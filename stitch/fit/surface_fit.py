@@ -222,6 +222,11 @@ def linearise_surfaces(measurements: Sequence[Measurement], model: Model, gates:
 def _free_views(
     measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
 ) -> tuple[tuple[Capture, ...], list[UnconstrainedPoses]]:
+    """Return the captures without the effects of a model, and their views freed from where it puts them.
+
+    Args:
+        gates: largest distance between partners, of each capture, length_unit.
+    """
     captures = tuple(corrected_capture(measurement, model) for measurement in measurements)
     unconstrained = [
         unconstrained_poses(c, c.poses(model.T_mount), gate) for c, gate in zip(captures, gates, strict=True)

@@ -62,6 +62,7 @@ def fit(
     """Fit the hand-eye to the scans; with effects, both. Labelled points that contradict the rest are taken out."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
+        """Fit all sessions once: by a given model, from a model, or by correction and then effects."""
         if start.given is not None:
             model = bind_to_session(start.given, measurements[0])
             return apply_given_hand_eye([corrected_capture(m, model) for m in measurements], model)
@@ -82,6 +83,7 @@ def fit(
 
 
 def _correct_hand_eye(measurements: Sequence[Measurement], hand_eye: CoarseHandEye, recorder: Recorder) -> Correction:
+    """Return the correction of the hand-eye that all sessions share, from all their scans."""
     captures = [measurement.capture for measurement in measurements]
 
     def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
@@ -107,6 +109,7 @@ def _weighed(measurements: Sequence[Measurement], correction: Correction) -> lis
 
 
 def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
+    """Return per session where its targets lie under the corrected model; None where it has none."""
     # How certain the hand-eye is need not be found here where there are none.
     return [
         None if m.capture.sightings is None else locate_targets(m, correction.model, correction.hand_eye.inflation)
@@ -205,6 +208,7 @@ def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: floa
 
 
 def _fused_rms(residual: Array) -> float:
+    """Return the rms (length_unit) of a fused cloud's residuals (N,) without edges; NaN where no point has one."""
     sample = take_mapped(residual, np.arange(0, len(residual), -(-len(residual) // _RMS_SAMPLES)))
     distances = sample[np.isfinite(sample)]
     if not len(distances):

@@ -223,6 +223,7 @@ class LinearisedTargets:
         return fit_variances(self._mixed(everything if enough else self.base), both_starts=True).variances
 
     def _whitened(self, free: Mask) -> WhitenedData:
+        """Return base, further columns and observations in units of their scatter beside the `free` parameters (P,)."""
         mixed = self._mixed(self.base)
         beside = self._mixed(np.concatenate([self.base, self.columns[..., free]], axis=2))
         half = whitener(mixed, fit_variances(beside, start=self._starting_variances).variances)

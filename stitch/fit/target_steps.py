@@ -41,6 +41,11 @@ def start(
 
 
 def _start_session(session: SessionData, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
+    """Return the hand-eye to begin with: of another run, as stated in session.toml, or in closed form.
+
+    Raises:
+        NoResultError: no target is seen in two views, and no other run says where they are.
+    """
     if file is None and _sightings(measurement).view_counts.max() < 2:
         raise NoResultError(
             f"{session.path}: no target is seen in two views; nothing shows whether the poses agree; to fix: with the "
@@ -86,9 +91,11 @@ def fit(
 def _fit_models(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
 ) -> FittedRig:
+    """Return the fit of models to labelled points, again without the outliers that it finds."""
     drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
 
     def once(measurements: Sequence[Measurement], before: list[TargetModelFit] | None) -> list[TargetModelFit]:
+        """Fit all sessions once, from the models of the fit before, or else from those to begin with."""
         begin = models if before is None else [targets.model for targets in before]
         landmarks = [
             initial_landmarks(corrected_capture(m, model), model.T_mount, drawing)

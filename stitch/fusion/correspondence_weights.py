@@ -154,6 +154,11 @@ class OffsetSums:
     """
 
     def __init__(self, g: Gram, matches: Sequence[Match], weights: Sequence[Array], capture: Capture) -> None:
+        """Sum the correspondences of all pairs of V views, each view with an offset along the normal beside its twist.
+
+        Args:
+            weights: (M,) of each match.
+        """
         views = g.views
         self.coupling = np.zeros((views, 6, views))  # Σ ±w Bᵀ, twists against offsets, less their sign
         self.matrix = np.zeros((views, views))  # Σ ±w

@@ -99,6 +99,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     dropped = Unsupported()
 
     def fuse_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
+        """Return the fused cloud of one slab, None where it is empty, and how many of its points support nothing."""
         voxels, unsupported = zip(*(view.voxels(number) for view in views), strict=True)
         together = _Voxels(*(np.concatenate(columns) for columns in zip(*map(_columns, voxels), strict=True)))
         del voxels
@@ -106,6 +107,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
         return cloud, sum(unsupported, Unsupported())
 
     def clouds() -> Iterator[FusedCloud]:
+        """Yield the clouds of slabs that hold some, and count what was dropped."""
         nonlocal dropped
         for cloud, unsupported in parallel(fuse_slab, range(slabs.count), "fusing slabs"):
             dropped += unsupported

@@ -200,6 +200,13 @@ class _LocalSurface:
     """The surface that k neighbours of N points span: votes, mean normal, height over the points, scatter, bend."""
 
     def __init__(self, around: Array, normals: Array, vote: Array) -> None:
+        """Fit N surfaces to k neighbours each.
+
+        Args:
+            around: (N, k, 3) neighbours from the point.
+            normals: (N, k, 3) of these, unit.
+            vote: (N, k) weight of each; 0: it does not count.
+        """
         self.normal = np.einsum("nk,nki->ni", vote, normals)
         self.normal /= np.maximum(np.linalg.norm(self.normal, axis=1, keepdims=True), 1e-12)
         cosine = np.einsum("nki,ni->nk", normals, self.normal)

@@ -163,6 +163,7 @@ def _tables(path: Path, name: str, form: str) -> Iterator[None]:
 
 
 def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
+    """Return direction (3,) and point (3,), None where not stated, of each external axis in a table of model.toml."""
     with _tables(path, "axes", "[axes.table] with direction, point; to fix: three numbers each"):
         axes = {
             str(name): (np.array(t["direction"], float), np.array(t["point"], float) if "point" in t else None)
@@ -210,6 +211,7 @@ def with_model_scanners(sessions: Sequence[SessionData], file: ModelFile) -> lis
 
 
 def _targets(path: Path, table: Any) -> dict[str, Target]:
+    """Return the targets in a table of model.toml by their names."""
     targets = {}
     with _tables(path, "targets", "[targets.ball1] with position, sigma; to fix: three numbers each"):
         for name, t in table.items():
@@ -221,6 +223,11 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
 
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
+    """Return the parameters of each effect in a table of model.toml by their names, as they were fitted.
+
+    Raises:
+        InputError: a value that is not finite, or a sigma that is none.
+    """
     with _tables(path, "effects", "[effects.joint_compliance.c2]; to fix: value, sigma, unit in each"):
         effects = {
             str(name): {
@@ -245,6 +252,11 @@ def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
 
 
 def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
+    """Return a matrix (size, size) of the table hand_eye.
+
+    Raises:
+        InputError: it is missing, of another shape, or not finite.
+    """
     try:
         matrix = np.array(table[key], float)
     except (KeyError, TypeError, ValueError, OverflowError):

@@ -121,6 +121,7 @@ class CommonCovariance:
         return b.of(a.of((pairs @ products.reshape(len(pairs), -1)).reshape(products.shape[1:]), 0), 1)
 
     def _kept_products(self, a: Array, b: Array) -> Array:
+        """Return the products of two sets of columns by pair of turned numbers, made once for either order."""
         products = self._products.get((id(a), id(b)))
         if products is None:
             products = pair_products(self._kept(a), self._kept(b))
@@ -146,6 +147,11 @@ class CommonCovariance:
                 self._kept(whole, turned)
 
     def _kept(self, whole: Array, turned: list[Array] | None = None) -> list[Array]:
+        """Return columns (n, p) turned by group, and remember them in place of those that were asked for longest ago.
+
+        Args:
+            turned: the same, where they are known already.
+        """
         turned = turned or self._turned.pop(id(whole), None) or self._turn(whole)
         self._wholes[id(whole)] = whole
         self._turned[id(whole)] = turned
@@ -160,6 +166,11 @@ class CommonCovariance:
         return turned
 
     def _turn(self, columns: Array) -> list[Array]:
+        """Return columns (n, p) turned into the axes in which the blocks of a group have one diagonal covariance.
+
+        Returns:
+            Of each group, of what is left of the noise, and of what is known, (p, rows, blocks).
+        """
         X = columns.reshape(*self.per_noise.shape, columns.shape[1])
         white = self.per_noise[..., None] * X
         parts = []

@@ -96,6 +96,12 @@ def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
 
 
 def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:
+    """Return groups of views whose poses lie near each other, by k-means; some may be empty.
+
+    Args:
+        T_base_flange: (V, 4, 4).
+        lever: length at which a turn counts as a shift, length_unit.
+    """
     twists = _pose_offsets(T_base_flange, lever)
     # Poses that repeat count once, in the order of their first visit: of fewer places than groups k-means would find
     # none to begin the last group with.

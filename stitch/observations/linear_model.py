@@ -244,6 +244,11 @@ class LinearModel:
         return {}
 
     def _fit_restricted(self, kept: frozenset[str]) -> Self:
+        """Return the model with only those components of its pose errors that are kept, its variances fitted anew.
+
+        Without any, rotation and translation scatter and the sensor's noise remain. Labelled points and many views have
+        no prior of pose errors, and the offsets of their joints are the one component that can be kept.
+        """
         if not kept:
             mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
             null = fit_variances(mixed, both_starts=True)

@@ -190,6 +190,7 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
 
 
 def _name(direction: Array, axes: dict[str, Array]) -> str:
+    """Return a direction (3,) in words: the axis that it is parallel to, or its components."""
     for name, axis in axes.items():
         if abs(float(direction @ axis)) / np.linalg.norm(axis) > _PARALLEL:
             return name

@@ -73,6 +73,7 @@ def _candidate_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
+    """Return a candidate as diagnosis.json has it."""
     ranked, validation = candidate.ranked, candidate.cross_validation
     observable = ranked.score.observable
     inside, heldout = (None, None) if validation is None else diagnosis.rms_if_added(validation)

@@ -36,6 +36,7 @@ def is_run_file(path: Path) -> Ours:
     inner = set(_inner_runs(path))
 
     def is_ours(inside: Path) -> bool:
+        """Return whether a file, by its path inside the folder, is one that a run writes."""
         if inside.parts[0] in inner:
             inside = inside.relative_to(inside.parts[0])
         match inside.parts:
@@ -132,6 +133,7 @@ def to_json(document: Any) -> str:
 
 
 def _without_nan(value: Any) -> Any:
+    """Return a value with null in the place of numbers that are not finite, which JSON does not have."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -110,6 +110,7 @@ def _heights(places: Array, points: Array, normals: Array, tree: Any, size: floa
     normal_columns = np.ascontiguousarray(normals.T)
 
     def heights_of(block: Array) -> tuple[Array, Array]:
+        """Return heights (P,) of places (P, 3) over the surface of their nearest points, and how far (P,) these lie."""
         distance, index = (np.ascontiguousarray(x.T) for x in tree.query(block, k=_NEIGHBOURS))
         facing = np.array([column.take(index) for column in normal_columns])
         away = np.array([at - column.take(index) for column, at in zip(point_columns, block.T, strict=True)])

@@ -86,6 +86,8 @@ class MeshFit:
     """How a mesh lies to the points (N, 3) that it was made of, of the same frame and unit; of many some are asked."""
 
     def __init__(self, mesh: TriangleMesh, points: Array) -> None:
+        """Measure how a mesh lies to points (N, 3): distances of some of them, and what of it no point supports."""
+
         import igl
 
         tree = KDTree(np.ascontiguousarray(points, float))

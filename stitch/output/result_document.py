@@ -414,6 +414,7 @@ def _disagreement(run: RunData) -> dict[str, Any] | None:
 
 
 def _versions() -> dict[str, str]:
+    """Return the version of stitch, and of each package that decides its numbers and is installed."""
     versions = {"stitch": stitch_version()}
     for package in _PACKAGES:
         try:

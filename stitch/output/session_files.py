@@ -102,6 +102,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def _write(folder: Path, session: SessionFiles) -> None:
+    """Write the files of a session into a folder."""
     folder.mkdir(exist_ok=True)
     head = {"format": SESSION_FORMAT, "name": session.name, "length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")

@@ -249,6 +249,12 @@ def _fused_views(document: dict[str, Any], run: RunData) -> list[results.ViewRow
 
 
 def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
+    """Return the fit of a stored run, with its correspondences searched anew where it left them.
+
+    Args:
+        document: result.json.
+        run: the run so far, with session and model.
+    """
     views = _fused_views(document, run)
     poses = np.array([row.pose for row in views])
     overlaps = registered = targets = None

@@ -37,6 +37,7 @@ def to_urdf(robot: Robot) -> str:
 
 
 def _add_link(root: ElementTree.Element, name: str, mass: float, com: Array) -> None:
+    """Add a link with its mass (kg) and centre of mass (3,), m."""
     link = ElementTree.SubElement(root, "link", name=name)
     if mass:
         inertial = ElementTree.SubElement(link, "inertial")
@@ -49,6 +50,7 @@ def _add_link(root: ElementTree.Element, name: str, mass: float, com: Array) -> 
 def _add_joint(
     root: ElementTree.Element, name: str, kind: str, parent: str, child: str, T: Array, metres: float
 ) -> None:
+    """Add a joint between two links; T (4, 4) is its frame in the parent, `metres` the length of its unit."""
     joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "origin", xyz=_text(T[:3, 3] * metres), rpy=_text(roll_pitch_yaw(T[:3, :3])))
     ElementTree.SubElement(joint, "parent", link=parent)

@@ -78,6 +78,7 @@ class CommonMove:
     """Hand-eye, targets, and a move of the base from a view on, by least squares."""
 
     def __init__(self, capture: Capture, T_mount: Array, T: Array | None = None, start: int | None = None) -> None:
+        """Place all labelled points, those from view `start` on as if the arm's base had moved by T (4, 4)."""
         self.capture, self.T_mount = capture, T_mount
         self.T = np.eye(4) if T is None else T
         self.start = len(capture.T_reference_mount) if start is None else start

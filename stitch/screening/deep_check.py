@@ -70,6 +70,11 @@ def deep_check(session: SessionData) -> list[SessionProblem]:
 
 
 def _check_clouds(session: SessionData) -> list[SessionProblem]:
+    """Return the problems of a session of scans: by the scanner's own motions, by its views, and by other readings.
+
+    A mistake that the motions prove is the answer alone: it makes all views look wrong. Else views are asked under the
+    poses as stated; another reading is only tried where that leads nowhere.
+    """
     session, capture = thin_session(session, _POINTS)
     capture = replace(capture, sightings=drop_mislabelled(capture.sightings))
     ranked = rank_hypotheses(session, register_scan_pairs(capture))

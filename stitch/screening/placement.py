@@ -128,6 +128,11 @@ def evaluate_placement(scan: Scan, T: Array, surface: ReferenceSurface) -> Place
 
 
 def _evaluate_placements(scan: Scan, poses: Array, surface: ReferenceSurface, probes: int) -> list[Placement]:
+    """Return how a scan closes with a surface at each of some poses (S, 4, 4): the share that is near it, and on it.
+
+    Args:
+        probes: points of the scan that are asked.
+    """
     index = sample_points(scan, probes)
     if not len(index):
         return [Placement(T, 0.0, 0.0) for T in poses]

@@ -139,6 +139,7 @@ def background_problems(
 
 
 def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str:
+    """Return a warning of poses that scatter as those of no arm do, with the views that move farthest."""
     model_poses = capture.poses(T_mount)
     twists = frames.log(snooping.unconstrained.poses @ frames.inverse(model_poses))
     middles = np.array([points.mean(axis=0) for points in capture.visible_points])

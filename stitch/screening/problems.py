@@ -51,6 +51,7 @@ def displacement_text(best: DisplacementSize, least: DisplacementSize, length_un
     usual_angle, usual_length = usual_twist(length_unit)[[0, 3]]
 
     def text(rotation: float, shift: float) -> str:
+        """Return a rotation (rad) and a shift (length_unit) in words; none whose bound is within what arms repeat."""
         parts = []
         if least[1] > usual_length:
             parts.append(length_text(shift, length_unit, _DIGITS))

@@ -46,6 +46,7 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
     """
 
     def closes(points: Array, eye: Array, reach: float) -> bool:
+        """Return whether points close with the surface of the others within `reach` (length_unit) of their pose."""
         other = prepare_scan(scan.name, points, eye=eye)
         placed = place_scan(other, surface, starts_about(T_pose, other, size), size)[0]
         placements = (evaluate_placement(other, T_pose, surface), placed)

@@ -239,6 +239,12 @@ def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
 
 
 def _tested(under: Projector, columns: Array, weighted: Array) -> AlternativeTest:
+    """Return the test of further columns (n, k) in the mean: their F statistic, p-value, estimates and information.
+
+    Args:
+        under: the null hypothesis.
+        weighted: (n, k) the columns times the null's projector.
+    """
     N = columns.T @ weighted
     u = columns.T @ under.projected
     # Units of the columns may differ.

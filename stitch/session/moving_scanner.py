@@ -80,6 +80,7 @@ class _RobotPath:
     """T_reference_mount between the views: splines through their poses."""
 
     def __init__(self, times: Array, T_reference_mount: Array) -> None:
+        """Join poses (V, 4, 4) at times (V,), s, by a smooth path: cubic splines of positions and of rotations."""
         self.times = times
         # Few sessions have a scanner that moves: the others do not wait for it.
         from scipy.interpolate import CubicSpline

@@ -349,6 +349,7 @@ def _solver(A: Array) -> Callable[[Array], Array]:
         L[j:, j] = below / np.sqrt(np.maximum(below[0], 1e-300))
 
     def solve(right: Array) -> Array:
+        """Return the solutions (m, N) of right sides (m, N): forward with the Cholesky factors, then backward."""
         out = np.array(right)
         for j in range(m):
             out[j] = (out[j] - np.einsum("kn,kn->n", L[j, :j], out[:j])) / L[j, j]

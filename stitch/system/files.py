@@ -224,6 +224,7 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
 
 
 def _let_go(lock: Path, descriptor: int) -> None:
+    """Close and remove a lock that this process holds, so that no other process gets one that is gone."""
     if ON_WINDOWS:  # where no open file can be removed, and one that the next writer has opened stays
         os.close(descriptor)
         with suppress(PermissionError):
@@ -234,6 +235,11 @@ def _let_go(lock: Path, descriptor: int) -> None:
 
 
 def _locked(lock: Path, what: Path) -> int:
+    """Return the descriptor of a lock, once this process alone holds it.
+
+    Raises:
+        BusyError: another process holds it, and writes `what`.
+    """
     while True:
         with report_errors_as(what, lock):
             descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)

@@ -82,6 +82,7 @@ def missing_packages() -> list[str]:
 
 
 def _loads(library: str) -> bool:
+    """Return whether the system can load a library."""
     try:
         ctypes.CDLL(library)
     except OSError:

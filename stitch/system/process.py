@@ -66,6 +66,7 @@ def tell_seconds(step: str) -> Iterator[None]:
     begun = time.monotonic()
 
     def tell() -> None:
+        """Print the step with its minutes and seconds now and again until it ends."""
         wait = QUIET
         while not ended.wait(wait):
             seconds = round(time.monotonic() - begun)

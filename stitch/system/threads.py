@@ -87,6 +87,7 @@ def begin(function: Callable[[], Result]) -> Future[Result]:
     future = Future[Result]()
 
     def run() -> None:
+        """Run the function, and hand its result or its error to the future."""
         library_threads_off()
         try:
             future.set_result(function())
@@ -183,6 +184,7 @@ def remembered(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
 
     @wraps(function)
     def kept(subject: Item) -> Result:
+        """Return what the function makes of a subject, made once and kept with it."""
         with lock:
             values = vars(subject)
             if key not in values:

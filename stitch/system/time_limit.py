@@ -62,6 +62,7 @@ def running_over() -> bool:
 
 
 def _start_watch() -> None:
+    """Start the thread that ends calls which take too long, unless it runs already."""
     global _watch
     if _watch is not None and _watch.is_alive():  # in a process that was forked it is not
         return
@@ -78,6 +79,7 @@ def _interrupt_call(*_: Any) -> None:
 
 
 def _check_calls() -> None:
+    """Interrupt calls that are overdue, and end the process where one does not heed it; runs in a thread of its own."""
     main = threading.main_thread().ident
     while True:
         time.sleep(_STEP)

@@ -155,6 +155,7 @@ def sum_smooth_errors(
         return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
 
     def of_targets() -> Array:
+        """Return how the errors move the labelled points, as in the scans."""
         assert capture.sightings is not None
         points, seen = capture.sightings.points, capture.sightings.target >= 0
         # An empty slot has no ray; nobody knows at what slant a target was seen.

@@ -64,6 +64,7 @@ class SurfaceTrial:
         return solutions
 
     def _solve(self, white: Array, z: Array, left_out: Indices | None) -> Array:
+        """Return coefficients (k,) of whitened columns (n, k) for observations z (n,), without some views."""
         k = white.shape[1]
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.

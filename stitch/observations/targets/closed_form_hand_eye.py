@@ -87,6 +87,7 @@ class _PointEquations:
     """left·(R p + t) − P = 0 of N sightings, with the targets' means eliminated."""
 
     def __init__(self, capture: Capture, s: Sightings) -> None:
+        """Take every labelled point of every view, centred and scaled, so that the equations are well conditioned."""
         v, slot = np.nonzero(s.used)
         self.left = capture.T_reference_mount[v]
         self.offset = s.points[v, slot].mean(axis=0)

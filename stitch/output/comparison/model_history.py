@@ -112,6 +112,7 @@ def models_of(run: RunData) -> list[tuple[str, Model]]:
 
 
 def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
+    """Return the model of a step of the ledger; None where one of its effects is not known here any more."""
     if any(name.partition("@")[0] not in EFFECTS or name not in step.values for name in step.effects):
         return None
     terms = []

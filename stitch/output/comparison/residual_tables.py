@@ -509,6 +509,7 @@ def _group_same_bins(tables: Sequence[ResidualTable]) -> list[tuple[ResidualTabl
 
 
 def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
+    """Return whether two tables have the same bins in another order: counts, means and rms agree but for rounding."""
     if len(a.count) != len(b.count):
         return False
     first, second = (np.lexsort((np.nan_to_num(t.rms), np.nan_to_num(t.mean), t.count)) for t in (a, b))
@@ -534,6 +535,7 @@ def comparison_document(comparison: ResidualTables) -> dict[str, object]:
 
 
 def _table_row(comparison: ResidualTables, table: ResidualTable) -> dict[str, object]:
+    """Return a table as JSON has it, with the p-value of its clearest mean and the tables that have the same bins."""
     row = {"name": table.name, "unit": table.unit, "label": list(table.label), "clearest": table.clearest}
     if not table.label:
         group = next(group for group in comparison.groups if any(x is table for x in group))

@@ -54,6 +54,7 @@ class HandEyeChange:
     """
 
     def __init__(self, a: RunData, b: RunData) -> None:
+        """Compare the hand-eye of run b with that of run a, at the points that b shows."""
         same = np.array_equal(a.T_mount, b.T_mount)  # else rounding would make a difference of it
         D = np.eye(4) if same else frames.inverse(a.T_mount) @ b.T_mount
         # exp(−ξ_A)·D·exp(ξ_B) = exp(Ad_D·ξ_B − ξ_A)·D for small ξ.
@@ -144,6 +145,7 @@ def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
 
 
 def _hand_eye_sentence(change: HandEyeChange, length_unit: str, what: str) -> str:
+    """Return how far two hand-eyes put `what` apart, and if their uncertainties explain it; without a full stop."""
     if not change.twist.any():
         return "Both have the same hand-eye"
     apart = f"The hand-eyes put the {what} {length_text(change.at_part, length_unit)} apart"

@@ -166,6 +166,7 @@ def _mat_bytes(path: Path) -> int:
 
 
 def _zip_bytes(path: Path) -> int:
+    """Return how many bytes the files of a ZIP archive unpack to, as it says; 0 where it is none."""
     try:
         with zipfile.ZipFile(path) as archive:
             return sum(entry.file_size for entry in archive.infolist())

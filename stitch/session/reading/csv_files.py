@@ -69,6 +69,7 @@ def _require_commas(file: Path, header: str) -> None:
 
 
 def _require_cells(file: Path, line: int, row: list[str], header: list[str]) -> None:
+    """Refuse a row of a table that has more or fewer cells than its header."""
     if len(row) != len(header):
         raise InputError(
             f"{file} line {line}: {len(row)} cells, the header has {len(header)}; to fix: write one cell a column, in "

@@ -82,6 +82,7 @@ def _pixels(path: Path) -> Array:
 
 
 def _exr(path: Path) -> Array:
+    """Return the points (H, W, 3) of an EXR that holds coordinates; else its depth (H, W), or colours (H, W, 3)."""
     require_exr_room(path)
     with import_extra("OpenEXR", path, "formats").File(str(path)) as file:
         channels = {name: np.asarray(channel.pixels, float) for name, channel in file.channels().items()}

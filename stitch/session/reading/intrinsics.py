@@ -162,6 +162,11 @@ def _list_numbers(value: Any) -> Array:
 
 
 def _distortion(file: Path, level: dict[str, Any]) -> Array:
+    """Return OpenCV's distortion k1, k2, p1, p2, k3 (5,), or (0,) where the lens has none.
+
+    Raises:
+        InputError: the numbers are those of another law.
+    """
     inner = level.get("distortion")
     if isinstance(inner, dict):
         named = {str(key).lower(): value for key, value in inner.items()}
@@ -185,6 +190,7 @@ def _whole_number(level: dict[str, Any], *names: str) -> int | None:
 
 
 def _units_per_metre(file: Path, level: dict[str, Any]) -> float | None:
+    """Return how many units of depth are a metre, whichever way the file says it; None where it does not."""
     value = level.get("depth_scale")
     if value is None:
         return None

@@ -224,6 +224,7 @@ def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) 
 
 
 def _require_turning(joint: Element) -> None:
+    """Refuse a joint that does not turn, or that follows another."""
     name, kind = joint.get("name"), joint.get("type")
     if kind not in ("revolute", "continuous"):
         raise InputError(f"joint {name} is {kind}; only revolute and continuous joints are known")

@@ -47,6 +47,7 @@ def poses_in_scans(files: list[Path]) -> Array | None:
 
 
 def _e57(file: Path) -> Array | None:
+    """Return the pose (4, 4) of the first scan of an E57, m; None where it has none."""
     require_e57_room(file)
     # A header is good for as long as its file is open.
     opened = import_extra("pye57", file, "formats").E57(str(file))
@@ -64,6 +65,7 @@ def _ptx(file: Path) -> Array:
 
 
 def _pcd(file: Path) -> Array | None:
+    """Return the viewpoint (4, 4) of a PCD, in its unit; None where it has none."""
     with file.open("rb") as stream:
         words = [line.split() for line in stream.read(_HEAD).split(b"\n")]
     viewpoint = next((line[1:] for line in words if line[:1] == [b"VIEWPOINT"]), None)

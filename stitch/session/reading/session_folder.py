@@ -175,6 +175,11 @@ def read_scans(
     metres = METRES[length_unit]
 
     def scan_of(row: ViewRow) -> Cloud | None:
+        """Return the checked cloud of a row of views.csv; None where it has no scan.
+
+        Raises:
+            InputError: names view and line.
+        """
         if not row.cloud:
             return None
         file = path / row.cloud

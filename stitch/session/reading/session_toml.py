@@ -93,6 +93,7 @@ def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = 
 
 
 def _require_entries(file: Path, table: str, entries: Any, known: Collection[str]) -> None:
+    """Refuse what is no table, or one with a key that is not known; name the known key that is most like it."""
     if not isinstance(entries, dict):
         raise InputError(f"{file}: [{table}] must be a table")
     for key in map(str, entries):
@@ -140,6 +141,7 @@ def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
 
 
 def _read_pose(file: Path, value: Any) -> Array:
+    """Return a pose (4, 4) whose rotation is exact; refuse what is no rigid motion."""
     try:
         T = np.array(value, float)
     except (TypeError, ValueError, OverflowError):
@@ -208,6 +210,11 @@ def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
 
 
 def _one_of(where: str, table: dict[str, Any], key: str, choices: Collection[str]) -> str:
+    """Return the value of a key that has to be one of some choices.
+
+    Raises:
+        InputError: it is none of them.
+    """
     value = table.get(key)
     if value not in tuple(choices):
         words = " or ".join(f'"{choice}"' for choice in choices)

@@ -360,6 +360,7 @@ def _otherwise_named_joints(header: Sequence[str]) -> list[str]:
 
 
 def _reaches_pose(robot: Robot, joints: Array, T: Array) -> bool:
+    """Return whether joint angles (J,), rad, bring the flange to a pose T (4, 4), within the limits of a table."""
     if not np.isfinite(joints).all():
         return False
     from_joints = forward(robot, joints)
