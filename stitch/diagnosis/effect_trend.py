@@ -8,6 +8,7 @@ A candidate's line is by how much it moves what the model predicts for these vie
 anew beside it, with its standard deviation. Effects of points are read along the rays, in bins of points.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,8 +21,10 @@ from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.deciding_view import model_beside, predict_views
 from stitch.diagnosis.dependence import Dependence
+from stitch.diagnosis.ranking import Ranked, conditioned_on_effects
 from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, by_joint, parameters_in, twist
 from stitch.model.forward import moves_points, point_correction, pose_derivatives, scan_points
@@ -223,17 +226,47 @@ def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
     """Return how far a joint is off along what its error follows without a name, beside its mean."""
-    fitted = linear.restricted(())
-    joint = curve.joint - 1
     error = np.interp(curve.view_values, curve.at, curve.error)
-    turned = _joint_columns(fitted)[:, joint : joint + 1]
-    response = turned * _of_rows(fitted, error[:, None], len(turned))
+    return _trend_of_joint(linear, linear, curve.joint, error, (*_axis_words(curve.covariate), curve.view_values))
+
+
+def trend_of_law(linear: LinearModel, ranked: Ranked) -> EffectTrend | None:
+    """Return how far a joint is off along what it follows by a law of the dictionary; None for a law elsewhere."""
+    law, scored = law_of(ranked), ranked.score
+    if law.place.joint is None:
+        return None
+    scattering = linear.restricted({JOINT_SCATTER})
+    beside = conditioned_on_effects(scattering, [ranked], scattering.null.variances)
+    axis = (*_axis_words(law.driver.name), law.driver.values)
+    return _trend_of_joint(linear, beside, law.place.joint, law.shapes @ scored.values, axis)
+
+
+def _axis_words(covariate: str) -> tuple[str, str]:
+    """Return what a covariate is called along an axis, and its unit where it stands beside."""
+    if covariate == "time_s":
+        return "time", "s"
+    angle = re.match(r"j(\d+)_deg(?=$|,)", covariate)
+    return (f"angle of joint {angle[1]}", "°") if angle else (covariate_text(covariate), "")
+
+
+def _trend_of_joint(
+    linear: LinearModel, scatter: LinearModel, number: int, error: Array, axis: _Axis
+) -> EffectTrend | None:
+    """Return the trend of an error (V,) rad of one joint, counted from 1, that no effect of the library makes.
+
+    Args:
+        scatter: with the variances of what is independent between views.
+    """
+    fitted = linear.restricted(())
+    turned = _joint_columns(fitted)[:, number - 1 : number]
+    # Beside its zero, of which such an error says nothing.
+    shapes = np.column_stack([error, np.ones_like(error)])
+    response = turned * _of_rows(fitted, shapes, len(turned))
     columns = _displacements(fitted, turned)[..., 0]
-    motion = _Motion(f"joint {curve.joint}", "rad", columns, error[:, None] * columns, joint)
-    name, unit = (covariate_text(curve.covariate), "") if curve.covariate != "time_s" else ("time", "s")
-    plot = _plot(fitted, linear, motion, (name, unit, curve.view_values))
+    motion = _Motion(f"joint {number}", "rad", columns, error[:, None] * columns, number - 1)
+    plot = _plot(fitted, scatter, motion, axis)
     change = _change(fitted, fitted.reduce(response), fitted)
-    return None if plot is None else plot.trend(change, motion.of, error * change.values[0])
+    return None if plot is None else plot.trend(change, motion.of, shapes @ change.values)
 
 
 def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:

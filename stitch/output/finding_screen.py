@@ -17,6 +17,7 @@ from stitch.diagnosis.effect_trend import (
     trend_in_model,
     trend_of_curve,
     trend_of_dependence,
+    trend_of_law,
     trends_of_candidates,
 )
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
@@ -123,6 +124,9 @@ def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | 
         return trends.get(diagnosis.effects[0])
     if diagnosis.verdict == "adequate":
         return trend_in_model(linear, linear.model.terms[-1]) if linear.model.effects else None
+    law = trend_of_law(linear, diagnosis.laws[0]) if diagnosis.laws else None
+    if law is not None:
+        return law
     if diagnosis.curves:
         return trend_of_curve(linear, diagnosis.curves[0])
     return trend_of_dependence(linear, diagnosis.depends_on[0]) if diagnosis.depends_on else None

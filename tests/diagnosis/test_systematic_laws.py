@@ -10,6 +10,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of, candidates_of
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
+from stitch.diagnosis.effect_trend import trend_of_law
 from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
@@ -106,8 +107,13 @@ def test_a_base_that_rocks_about_the_axis_of_joint_2_is_said_beside_the_joint(mo
     monkeypatch.setattr(labelled_arm, "joints_of", lambda rng, views: drawn(rng, views) * [1 - still, 1, 1, 1, 1, 1])
     errors = np.outer(PAYLOAD - 3, [0, 3e-4, 0, 0, 0, 0])
     session = labelled_cell(7, VIEWS, payload=PAYLOAD, errors=(errors, np.zeros((VIEWS, 6))))[0]
-    places = [law_of(r).place.name for r in diagnose_state(run(session)).laws]
-    assert places == ["joint 2", "the scanner's stand or the base"][: 1 + still]
+    found = diagnose_state(run(session))
+    assert [law_of(r).place.name for r in found.laws] == ["joint 2", "the scanner's stand or the base"][: 1 + still]
+    # The dots lie about the law by what is independent between views.
+    trend = trend_of_law(found.linear, found.laws[0])
+    assert trend.of == "joint 2" and trend.follows == "payload kg"
+    assert 0.4 < np.mean(((trend.measured - trend.predicted) / trend.sigma) ** 2) < 2
+    assert np.ptp(trend.predicted) > 5 * np.median(trend.sigma)
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ function showScreen(root, part, found, um) {
       return;
     }
     const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.map(e => found.candidates.find(c => c.effect === e.effect));
-    const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their trend" : "what the effect predicts");
+    const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, asked !== null || found.verdict !== "unknown_effect");
     title.textContent = plot.title;
     if (!asked && found.formula) say(found.formula);
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
@@ -155,8 +155,8 @@ function fromTo(a, b) {
   return unit === last ? `${x} → ${y}\u00a0${last}` : `${x}\u00a0${unit} → ${y}\u00a0${last}`;
 }
 
-// The plot of one course of diagnosis.json.
-function coursePlot(course, names, um, line = "what the effect predicts") {
+// The plot of one course of diagnosis.json; `known`: of an effect, and not of what has no name.
+function coursePlot(course, names, um, known = true) {
   const mrad = course.value_unit === "rad", factor = mrad ? 1e3 : um, unit = mrad ? "mrad" : "µm";
   const inOrder = course.follows === "view order", seconds = course.unit === "s";
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
@@ -168,7 +168,7 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const jumps = first > 0 && side.slice(first).every(s => s !== side[0]);
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ± ${shortNumber(2 * about[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are off" : "is off without it in the model"} (${unit}), ± 2σ. Dots: measured${course.after ? ", open: with it in the model" : ""}. Line: ${course.of.endsWith("views") ? "their mean, bin by bin" : line}`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are off" : known ? "is off without it in the model" : "is off"} (${unit}), ± 2σ. Dots: measured${course.after ? ", open: with it in the model" : ""}. Line: ${course.of.endsWith("views") ? "their mean, bin by bin" : known ? "what the effect predicts" : "their trend"}`,
     perUnit: seconds ? 1 / per : 1,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },

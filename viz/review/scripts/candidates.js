@@ -9,7 +9,7 @@ let all = false;
 // `ask` sends a command; `busy` while one that changes the run is under way.
 export function showCandidates(state, ask, busy) {
   const root = at("missing"), found = state.diagnosis;
-  why(found && found.why, state);
+  why(found && found.why, state, found && found.verdict !== "unknown_effect");
   if (!found) {
     root.replaceChildren(element("p", { class: "soft" }, "Every effect of the library is tried on what the poses leave, and validated on views left out."),
       element("code", { class: "command" }, `stitch diagnose ${state.run}`));
@@ -66,11 +66,11 @@ function candidate(c, found, state, most, ask, busy) {
 }
 
 // Why: every view along what an effect does, and what it predicts; a dot chooses its view.
-function why(course, state) {
+function why(course, state, named = true) {
   const root = at("why");
   root.hidden = !course;
   if (!course) return;
-  const plot = window.coursePlot(course, state.view_names, state.um);
+  const plot = window.coursePlot(course, state.view_names, state.um, named);
   root.querySelector("h3").textContent = plot.title;
   window.xyPlot(root.querySelector("div"), plot.spec, 220, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
 }
