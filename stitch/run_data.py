@@ -235,7 +235,7 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
 
     @cached_property
     def fit(self) -> Fit:
-        """What the stages found.
+        """The fit of the run: stages, poses, fused cloud; read from the run's folder where it is not in memory.
 
         Raises:
             InputError: a file of the run's folder is damaged, or belongs to another model or session.

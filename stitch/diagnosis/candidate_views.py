@@ -126,8 +126,10 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
 
 
 def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
-    """Return those at joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all
-    views."""
+    """Return the torques at joint angles (K, n), rad, with the last view's payload.
+
+    Where torques were measured, those of the view whose joint angles are nearest.
+    """
     if views.torques.measured:
         near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
         return views.torques.only(near)

@@ -449,7 +449,7 @@ def _independent(linear: LinearModel) -> Array:
 
 
 def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
-    """Return what an effect moves, by its place in the chain of frames."""
+    """Return the motion along which an effect is drawn: of one joint, of the mount, or else where it moves views most."""
     term = effect.term
     response = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
     unit = linear.measurement.length_unit
@@ -508,7 +508,10 @@ def _displacements(linear: LinearModel, response: Array) -> Array:
 
 
 def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
-    """Return what an effect of views lives on, its unit, and where the views stand along it."""
+    """Return over what an effect of views is drawn, in words, its unit, and its value (V,) in each view.
+
+    That is what the effect depends on: a joint's quantity, gravity, a covariate or time; else the order of the views.
+    """
     effect = term.effect
     if motion.joint is not None:
         return _joint_axis(views, term, motion.joint)
@@ -530,7 +533,7 @@ def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
 
 
 def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
-    """Return what an effect of a joint, counted from 0, lives on."""
+    """Return over what an effect of a joint, counted from 0, is drawn: torque, last move, speed, or else its angle."""
     number = joint + 1
     bending = [k for k, bent in enumerate(views.torques.joint) if bent == joint]
     if "torque" in term.effect.needs and bending:

@@ -67,10 +67,10 @@ def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tupl
 
 
 def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array | None = None) -> Ranked:
-    """Return one candidate that was chosen among so many.
+    """Return the score of one candidate, ranked as one that was chosen among `tests` of them.
 
     Args:
-        start: of `score`.
+        start: (c,) variances to begin with; None: where their maximum may lie.
     """
     return rank([score(linear, candidate, start)], tests)[0][0]
 

@@ -219,7 +219,10 @@ class Dictionary:
         return list(stacked(self.laws))
 
     def without(self, linear: LinearModel, laws: Sequence[Ranked], effect: Ranked) -> tuple[Ranked, ...]:
-        """Return those of some laws that an effect does not say, nor does at its own place in these views."""
+        """Return the laws that are something else than an effect: it does not say them, nor are they it in these views.
+
+        There, a law of the effect's own place is the effect where its columns are combinations of the effect's.
+        """
         rivals = [r for r in laws if effect.name not in self.said_by[law_of(r).key]]
         place = effect.score.candidate.effect.place
         explained = Span(linear.residual(effect.score.form.columns))

@@ -110,7 +110,7 @@ def together_sentence(together: Together) -> str:
 
 
 def together_document(together: Together, sessions: Sequence[str]) -> dict[str, Any]:
-    """Return it for --json."""
+    """Return what several sessions say together, as `--json` has it."""
     return {
         "format": "stitch-together/1",
         "sessions": list(sessions),
@@ -133,7 +133,14 @@ def _is_shared(candidate: Candidate) -> bool:
 
 
 def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int) -> Shared:
-    """Return one effect with common numbers: each session at the scatter that is left beside the effect there."""
+    """Return one effect fitted with common parameters to all sessions, and the log Bayes factor of that.
+
+    Each session tells information and vector of the parameters at the scatter that the effect leaves there; they add.
+
+    Args:
+        scores: of the effect, by session.
+        tests: effects among which it was chosen.
+    """
     parts = []
     for linear, scored in zip(linears, scores, strict=True):
         variances = linear.null.variances

@@ -192,7 +192,7 @@ class Parameter:
 
     @property
     def status(self) -> str:
-        """Whether it was fitted, or why it was held."""
+        """Whether the parameter was fitted, or why it was held, in words."""
         if self.kept:
             return "of another run's arm, as it is"
         if self.fitted:

@@ -89,7 +89,7 @@ def linearise(session: SessionData, measurement: Measurement, model: Model, gate
 
 
 def coarse_stage(session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float) -> StageResult:
-    """Return how well the views of one session agree under the hand-eye to begin with.
+    """Return the coarse stage of a session: rms (length_unit) and number of correspondences under the first hand-eye.
 
     Raises:
         NoResultError: no two views overlap.

@@ -233,7 +233,13 @@ class LinearisedTargets:
         return WhitenedData(base, further, seen[:, 0])
 
     def _normal_equations(self, mixed: MixedModel, sizes: Array, values: Array, variances: Array) -> BlockLeastSquares:
-        """Those of a step; the prior of the effects is about zero, not about their present values."""
+        """Return the normal equations of a step from the present values; the prior of the effects is about zero.
+
+        Args:
+            sizes: (P,) plausible sizes of the effects' parameters.
+            values: (P,) where these are now.
+            variances: (3,) of rotation scatter, translation scatter and the sensor's noise.
+        """
         far = []
         for session in self.sessions:
             distance = float(np.median(np.linalg.norm(np.concatenate(session.rows.capture.point_sets), axis=1)))

@@ -38,7 +38,12 @@ class ChainErrors:
 
 
 def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
-    """Return what some effects do to the chain of frames, beside what others have done already."""
+    """Return how effects change joint angles, links, mount, part, base and axes of the chain of frames, in all views.
+
+    Args:
+        terms: effects with their values.
+        base: what others have done already; None: nothing.
+    """
     views = measurement.views
     if base is None:
         right = exact_links(*views.joints.shape)

@@ -266,8 +266,14 @@ def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
 def covariance_of_fit(
     terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array, with_hand_eye: Array | None = None
 ) -> EffectsCovariance:
-    """Return that of the fitted parameters (K of P, bool) with their matrix (K, K), beside those kept, with their root
-    (P, L); `with_hand_eye` (6, 6 + K) counts where there are axes."""
+    """Return the covariance of the P parameters of effects: of those fitted, and of those kept from another run.
+
+    Args:
+        fitted: (P,) bool, K of them.
+        matrix: (K, K) their covariance.
+        kept: (P, L) root of the covariance of those kept: zero rows for the others.
+        with_hand_eye: (6, 6 + K) of the hand-eye with itself and with those fitted; handed on where there are axes.
+    """
     names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
     whole = kept @ kept.T
     whole[np.ix_(fitted, fitted)] += matrix

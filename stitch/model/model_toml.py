@@ -310,7 +310,7 @@ def keep_arm_effects(file: ModelFile) -> ModelFile:
 
 
 def arm_model(file: ModelFile) -> ModelFile | None:
-    """Return the same; None without an effect of the arm.
+    """Return the arm's effects of a model, to be kept as they are, without its targets; None without such an effect.
 
     Raises:
         InputError: an effect that is not known.

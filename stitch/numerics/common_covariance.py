@@ -275,7 +275,7 @@ def common_covariance(scattered: Sequence[Array], noise: Array, known: Array) ->
 
 
 def _group_of(J: Array, blocks: Indices, component: Indices) -> CovarianceGroup | None:
-    """Return some blocks as a group, if they have one covariance.
+    """Return some blocks as a group whose covariance is diagonal in one system of axes for each; None if it is not.
 
     Args:
         J: (V, m, s) what a unit of scatter along each of s axes does to their numbers, in units of the noise.

@@ -63,7 +63,7 @@ def invert_covariance(V: Array) -> InverseCovariance:
 
 
 def _invert_single(V: Array) -> InverseCovariance:
-    """Of one block, by LAPACK."""
+    """Return the inverse of the covariance (m, m) of a single block, by LAPACK; determinant inf where it has none."""
     L, failed = dpotrf(V, lower=1, clean=1)
     if failed:
         return InverseCovariance(V[None], V[None], np.inf)
@@ -139,7 +139,14 @@ class BlockLeastSquares:
         return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
 
     def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
-        """Return the same under each prior; one of fewer than k columns is of the first ones, the others left out."""
+        """Return estimates under each prior, without some blocks.
+
+        Args:
+            priors: precision (p,), and precision times mean (p,), of the first p of the k columns; others are left out.
+
+        Returns:
+            (p,) for each prior.
+        """
         sums = self._sums
         if left_out is not None:
             rows = self._rows[np.asarray(left_out, np.int64)].reshape(-1, len(sums))
@@ -278,7 +285,7 @@ def independent(base: Array, further: Array, sizes: Array, threshold: float) -> 
 
 
 def project_out(base: Array, columns: Array) -> Array:
-    """What is left of `columns` beside the column space of `base`."""
+    """Return `columns` (n, p) less their projection onto the column space of `base` (n, a)."""
     if not base.shape[1]:
         return columns
     U = column_space(base)
@@ -286,11 +293,11 @@ def project_out(base: Array, columns: Array) -> Array:
 
 
 def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
-    """What one model leaves over what another leaves, mean squares, and the standard error of that.
+    """Return the ratio of the mean squares that two models leave, and its standard error over samples.
 
     Args:
-        with_it: (G,) sum of squares of each sample, a group of views or one view, under the one.
-        without: (G,) under the other.
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under the first model.
+        without: (G,) under the second, by which is divided.
     """
     share = float(with_it.sum() / max(without.sum(), 1e-300))
     spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)

@@ -173,7 +173,14 @@ def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) ->
 def select_forward(
     gain: Callable[[Sequence[int]], float], groups: Sequence[int], begin: Sequence[int] = (), most: int | None = None
 ) -> list[int]:
-    """From nothing, or from some: the group that gains most is added until none gains enough."""
+    """Return groups of parameters, chosen one after the other: the one that gains most, until none gains enough.
+
+    Args:
+        gain: log Bayes factor of some groups together, nats.
+        groups: to choose from.
+        begin: groups that are in from the start.
+        most: groups in all; None: no limit.
+    """
     chosen = list(begin)
     while (left := [k for k in groups if k not in chosen]) and (most is None or len(chosen) < most):
         best = max(left, key=lambda k: gain([*chosen, k]))

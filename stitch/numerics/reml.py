@@ -226,7 +226,7 @@ class FurtherColumns:
 
 @dataclass(frozen=True)
 class ModelInformation:
-    """What a model whose blocks have one covariance holds against further columns, at the variances of a fit of it."""
+    """How further columns are asked for beside a model whose blocks have one covariance, at the variances of a fit."""
 
     mixed: MixedModel
     pairs: Array  # (t,) what every pair of turned numbers counts
@@ -245,7 +245,11 @@ class ModelInformation:
 
 
 def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
-    """Return what the model holds against further columns at the variances of a fit, with or without such columns."""
+    """Return what is needed to ask for further columns beside a model at the variances of a fit.
+
+    Args:
+        fit: of the model, with or without further columns.
+    """
     a = mixed.A.shape[2]
     half, _ = _root_of_inverse(fit.sums[:a, :a])
     pairs = mixed.sums.common.weights(fit.variances).pairs

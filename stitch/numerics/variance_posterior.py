@@ -76,7 +76,7 @@ class Satterthwaite:
         return float(min(2 / max(shares @ self.spread @ shares, 2 / _MANY), _MANY))
 
     def of_each(self, white: Array) -> Array:
-        """The same (p,) along each of the columns by itself."""
+        """Return the degrees of freedom (p,) of the scatter along each whitened column (B, m, p) by itself."""
         squares = np.sum(white**2, axis=(0, 1))
         shares = np.einsum("bmp,cbmp->cp", white, self.white @ white) / np.maximum(squares, 1e-300)
         known = 2 / np.maximum(np.sum(shares * (self.spread @ shares), axis=0), 2 / _MANY)
@@ -84,7 +84,11 @@ class Satterthwaite:
 
 
 def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
-    """From the fit without the columns that are asked for."""
+    """Return how well the variances of a fit are known, from the expected information of REML.
+
+    Args:
+        null: the fit without the columns whose degrees of freedom are asked for.
+    """
     half = whitener(mixed, null.variances)
     white = null.variances[:, None, None, None] * (half @ mixed.components @ half.transpose(0, 2, 1))
     mean = half @ mixed.A
@@ -176,7 +180,13 @@ def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
 
 
 def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
-    """Per component the variances that it may have; the first of those that may be absent stands for all below."""
+    """Return by component the grid of variances over which is integrated, in equal steps of their logarithms.
+
+    The first one of a component that may be absent stands for all below.
+
+    Args:
+        likeliest: (c,) variances.
+    """
     usual = 1e-4 * usual_variances(mixed.z, mixed.components)
     usual[NOISE] = likeliest[NOISE]
     if mixed.further is not None:

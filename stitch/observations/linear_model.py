@@ -264,7 +264,10 @@ class LinearModel:
         return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     def refit(self) -> Self:
-        """Return the same with the null fitted anew, from every place where its maximum may lie."""
+        """Return the model with its variances fitted anew, from every place where their maximum may lie.
+
+        From the likeliest of these alone where there are many observations, since each fit takes long there.
+        """
         starts = [other.null for other in self.alternative_starts]
         starts += [at_variances(self.mixed, self.null.variances)] if self.full_model is None else []
         if self.mixed.size > _SINGLE_START_SIZE:

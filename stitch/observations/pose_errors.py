@@ -293,7 +293,7 @@ class PoseErrors:
         return FurtherPrior(self.scales, shapes, self.arm_components, self.scatter)
 
     def project(self, reduction: Array) -> "PoseErrors":
-        """The same of numbers reduction (n, 6V) @ twists."""
+        """Return the errors of numbers that are made of twists of the views by `reduction` (n, 6V)."""
         return replace(
             self,
             components=np.array([reduction @ C @ reduction.T for C in self.components]),
@@ -301,7 +301,7 @@ class PoseErrors:
         )
 
     def restricted(self, keep: Collection[str]) -> "PoseErrors":
-        """Return what poses may err by these `causes` alone."""
+        """Return the pose errors of these causes alone: names of components, or of effects that are part of one."""
         left = {name: part for name, part in self.effects.items() if name in keep}
         kept, components = list[int](), list[Array]()
         for i, name in enumerate(self.names):
@@ -329,7 +329,9 @@ def white_scatter_only(views: int) -> PoseErrors:
 
 
 def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
-    """The prior for the sessions of a rig: one arm, one scanner, one mount; none for very many views.
+    """Return the prior of pose errors for the sessions of a rig: one arm, one scanner, one mount.
+
+    Of very many views white scatter alone.
 
     Args:
         model: hand-eye and effects in use; the arm errs beside these.

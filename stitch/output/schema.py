@@ -103,7 +103,7 @@ class Document:
 
     @property
     def schema(self) -> Schema:
-        """What is checked before a document is read, as JSON Schema."""
+        """JSON Schema that a document has to match before it is read."""
         checked = [key for key in self.keys if key.kind.schema]
         return {
             "type": "object",
@@ -120,7 +120,11 @@ class Document:
         }
 
     def fields(self, document: dict[str, Any], of: type | None = None) -> dict[str, Any]:
-        """Return what a document fills of a class, by the names of its fields."""
+        """Return the values that a document has for the fields of a class, by their names.
+
+        Args:
+            of: the class, where a document fills several.
+        """
         return {
             (key.attribute or key.name).rpartition(".")[2]: key.kind.read(document[key.name])
             for key in self.keys

@@ -134,7 +134,7 @@ class CommonMove:
         return best
 
     def _stepped(self) -> "CommonMove":
-        """Return one step of Gauss and Newton."""
+        """Return the move after one Gauss–Newton step of hand-eye and base: 12 unknowns, turns about middles."""
         p = self.sightings.points[self.view, self.slot]
         middle = p.mean(axis=0)
         there = self.in_base.mean(axis=0)

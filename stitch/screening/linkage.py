@@ -64,7 +64,7 @@ class Linkage:
 
 
 def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
-    """Find components, and views held by a single pair, from the correspondences at the poses of `overlaps`.
+    """Return the linkage of views by the correspondences at the poses of `overlaps`.
 
     Args:
         holding_nothing: views whose scans hold no pose, however well they lie on the others.
@@ -149,7 +149,12 @@ def _contradicted_share(shown: dict[int, PointVisibility], without: Sequence[int
 def _point_visibility(
     scans: Sequence[Scan], poses: Array, tolerance: float, reach: float
 ) -> list[dict[int, PointVisibility]]:
-    """Per view and other view what that shows of each asked point (n,)."""
+    """Return by view, and by other view near it, what the latter shows of each point (n,) that the former asks for.
+
+    Args:
+        tolerance: distance along the normal that is the same place, length_unit.
+        reach: how far from a point another surface is sought, length_unit.
+    """
     near: list[list[int]] = [[] for _ in scans]
     for v, w in near_pairs(scans, poses, reach):
         near[v].append(w)
@@ -163,7 +168,7 @@ def _point_visibility(
             parts[w].append((v, slice(k % turns, None, turns)))
 
     def of_asked(w: int) -> dict[int, PointVisibility]:
-        """Return by view that asks what view w shows of its points: of all at once."""
+        """Return by view that asks what view w shows of its points (n,); all that ask w are searched at once."""
         if not parts[w]:
             return {}
         _, points, normals = queries.gather(parts[w])

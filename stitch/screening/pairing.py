@@ -38,7 +38,10 @@ _MOVED = {"part": "the part was clamped anew", "scanner": "the scanner moved on 
 def explain_misplaced(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> list[SessionProblem]:
-    """Return one problem for everything that snooping found, with the rows and what to do.
+    """Return the problems that explain every view and step which snooping found, with the rows and what to do.
+
+    What one mistake of several rows explains is not blamed on single views: copies first, then scans that fit each
+    other's rows, then views by themselves; steps and groups without a common surface are named as such.
 
     Args:
         session, capture: with the same views.

@@ -111,8 +111,10 @@ class ViewModel:
 
     @cached_property
     def steps(self) -> dict[str, Array]:
-        """By the body that moves, (V, n, 6) response to a displacement that each view and all after it have in common:
-        of the part as `views`, of the scanner as `mounts`."""
+        """By the body that moves, part or scanner, (V, n, 6) response of the evidence to a step at each view.
+
+        A step displaces that view and all after it alike: as `views` does of the part, `mounts` of the scanner.
+        """
         return {
             moved: np.cumsum(of_views[::-1], axis=0)[::-1]
             for moved, of_views in (("part", self.views), ("scanner", self.mounts))
@@ -399,7 +401,11 @@ class UsualEffects:
 
 
 def thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:
-    """The same with fewer correspondences, each of more weight: what an effect roughly does to poses needs no more."""
+    """Return unconstrained views with every so many-th correspondence, each of as much more weight.
+
+    What an effect roughly does to poses needs no more.
+    """
+    # Rounded up.
     every = -(-sum(len(m.residual) for m in unconstrained.overlaps.matches) // _MAX_CORRESPONDENCES) or 1
     thinned = [
         replace(

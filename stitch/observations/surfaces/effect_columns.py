@@ -41,7 +41,11 @@ class PointGram:
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
     def merge_sides(self, per_view: int) -> "PointGram":
-        """Of sums for either view of a pair its own, in so many parameters, those for parameters that all share."""
+        """Return the sums for parameters that all views share, from those for parameters of each view of a pair.
+
+        Args:
+            per_view: parameters that either view of a pair has for itself; they come first, twice.
+        """
         shares = np.vstack([np.eye(per_view), np.eye(per_view)])
         rest = self.residual.shape[1] - 2 * per_view
         A = np.block([[shares, np.zeros((2 * per_view, rest))], [np.zeros((rest, per_view)), np.eye(rest)]])
@@ -175,7 +179,15 @@ def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, 
 def _target_pair_sums(
     unconstrained: UnconstrainedPoses, noise_factor: float, of_targets: Callable[[], Array], per_view: int
 ) -> list[tuple[Array, ...]]:
-    """The same sums for every pair of views with common targets: the change of x_v − x_w is a vector."""
+    """Return per pair of views with common targets the sums that `PointGram` has: vector, residual and square.
+
+    What changes is the difference of two places of a target, a vector, where surfaces have a distance.
+
+    Args:
+        noise_factor: of the targets' weights.
+        of_targets: returns how each parameter moves the targets (K, V, S, 3), sensor frame.
+        per_view: parameters that either view of a pair has for itself.
+    """
     targets, g = unconstrained.overlaps.targets, unconstrained.overlaps.gram
     if targets is None:
         return []

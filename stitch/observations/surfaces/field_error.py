@@ -95,10 +95,11 @@ def field_error(
     alpha: float,
     nuisance_effects: Sequence[Term] = (),
 ) -> FieldError:
-    """Return what the overlaps show of it; what it exceeds at the level `alpha`.
+    """Return the smooth errors of the scanner that the overlaps show: of all views alike, and of single views.
 
     Args:
-        nuisance_effects: effects of points that may have any size there.
+        alpha: chance at which an error counts that is none.
+        nuisance_effects: effects of points, of any size, that explain what they can first.
     """
     sums, noise = sum_smooth_errors(
         measurement, unconstrained, PointSlopes(measurement, nuisance_effects, model), per_view=True
@@ -170,15 +171,15 @@ def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
 
 
 def _follows_time(errors: Array, alpha: float) -> bool:
-    """Return whether smooth errors of single views trend with their order: a permutation test at level `alpha`.
+    """Return whether smooth errors of parts of a session trend with their order: a permutation test at level `alpha`.
 
     Args:
-        errors: coefficients of the errors, `COARSE` of each view, one view after the other.
+        errors: coefficients of the errors, `COARSE` of each part (`part_of_view`), one part after the other.
     """
-    views = len(errors) // COARSE
-    errors = errors.reshape(views, -1)
-    order = np.arange(views) - (views - 1) / 2
-    generator = np.random.default_rng(views)
+    parts = len(errors) // COARSE
+    errors = errors.reshape(parts, -1)
+    order = np.arange(parts) - (parts - 1) / 2
+    generator = np.random.default_rng(parts)
     others = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
     trend = np.linalg.norm(order @ errors)
     return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS) < alpha)

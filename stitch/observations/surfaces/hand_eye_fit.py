@@ -108,7 +108,7 @@ class CaptureEvidence:
         return self.reduced_poses.reduction @ self.common_twists
 
     def without(self, views: Indices) -> "CaptureEvidence":
-        """Return the same without some views."""
+        """Return the evidence of a capture without some views, whose pairs go too."""
         g = self.gram
         keep = np.asarray(~np.isin(g.pairs, views).any(axis=1))
         stays = ~np.isin(np.arange(g.views), views)

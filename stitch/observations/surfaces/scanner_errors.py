@@ -155,7 +155,7 @@ def sum_smooth_errors(
         return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
 
     def of_targets() -> Array:
-        """Return how the errors move the labelled points, as in the scans."""
+        """Return how unit errors move the labelled points (K, V, S, 3), sensor frame, length_unit."""
         assert capture.sightings is not None
         points, seen = capture.sightings.points, capture.sightings.target >= 0
         # An empty slot has no ray; nobody knows at what slant a target was seen.
@@ -312,7 +312,7 @@ def shared_error_likelihood(
 def view_error_likelihood(
     sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
 ) -> SmoothErrorLikelihood:
-    """Return that of smooth errors for either view of a pair its own, those that all share, and what is beside them.
+    """Return the likelihood of smooth errors of each part of a session, of those that all share, and of what is beside.
 
     Args:
         sums: of `sum_smooth_errors` with errors of every view.

@@ -54,7 +54,7 @@ class SurfaceTrial:
         return self._solve(self._white_X, self.linear.white_z, left_out)
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """Return the same under each prior; zero beyond the coefficients that it is of."""
+        """Return coefficients (k,) under each prior, without some views; zero beyond those that the prior is of."""
         white, solutions = self._white_X, []
         for prior in priors:
             half, k = np.sqrt(prior.precision), len(prior.precision)

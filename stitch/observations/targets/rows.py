@@ -195,7 +195,12 @@ def target_rows(capture: Capture, T_mount: Array, landmarks: Landmarks) -> Targe
 def _coordinate_rows(
     s: Sightings, poses: Array, centre: Array, landmarks: Landmarks
 ) -> tuple[Array, Array, Array, Array]:
-    """What is left (V, 3S), its variance, (V, 3S, 6) per twist of the view and (V, 3S, U) per landmark."""
+    """Return the rows of the coordinates of S targets in V views, linearised about hand-eye and landmarks.
+
+    Returns:
+        Residual (V, 3S) and its variance, length_unit and its square; its change (V, 3S, 6) per left twist of the view
+        about the centre, and (V, 3S, U) per unknown of the landmarks. Zeros where a view does not show a target.
+    """
     V, S = s.used.shape
     known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
     left = (frames.transform(poses, s.points) - known).reshape(V, -1)
@@ -212,7 +217,10 @@ def _coordinate_rows(
 
 
 def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
-    """The same of the three rows (rad) of a probe's turn; zeros where nobody knows how it is held."""
+    """Return the three rows (rad) of a probe's turn in V views, as `_coordinate_rows` does those of coordinates.
+
+    Zeros where nobody knows how the probe is held.
+    """
     V, at = len(poses), landmarks.positions.size
     left, noise = np.zeros((V, 3)), np.zeros((V, 3))
     lever, columns = np.zeros((V, 3, 6)), np.zeros((V, 3, landmarks.size))
@@ -226,8 +234,12 @@ def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple
 
 
 def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
-    """Of D nominal targets less their places in the drawing: what is left (D, m), (D, m, U) per landmark, and the
-    variance (D, m) that is known; three rows each, the others absent."""
+    """Return the rows that hold D landmarks to their nominal places in a drawing.
+
+    Returns:
+        Residual (D, m), length_unit, its change (D, m, U) per unknown of the landmarks, and its known variance (D, m);
+        the first three of m rows count, the others have unit variance.
+    """
     count = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
     left, columns, fixed = np.zeros((count, m)), np.zeros((count, m, landmarks.size)), np.ones((count, m))
     if landmarks.drawing is None or landmarks.T_reference_part is None:

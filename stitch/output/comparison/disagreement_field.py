@@ -167,7 +167,7 @@ class Patches:
         return sums.reshape(self._counts.shape).astype(float)
 
     def _standard_errors(self, quiet: Array) -> Array:
-        """Return those of the weighted mean of the cells of a patch, by their scatter about it.
+        """Return standard errors (V, K) of each view's mean in each patch, by the scatter of the cells about it.
 
         That is Σ a²(m − d)², a the weights. Neighbouring distances share points and normals; cells are wide enough not
         to.
