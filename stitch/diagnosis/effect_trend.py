@@ -449,7 +449,7 @@ def _independent(linear: LinearModel) -> Array:
 
 
 def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
-    """Return the motion along which an effect is drawn: of one joint, of the mount, or else where it moves views most."""
+    """Return the motion along which an effect is drawn: of one joint, of the mount, else where it moves views most."""
     term = effect.term
     response = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
     unit = linear.measurement.length_unit
