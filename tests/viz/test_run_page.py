@@ -270,6 +270,30 @@ def test_why_has_a_dot_for_every_view_and_a_line_that_jumps(screen, diagnosed_pa
     assert screen.locator("[data-why] text", has_text=f"from {diagnosed_page.views[2]} on").count() == 1
 
 
+def test_what_to_type_is_in_sight_at_once(screen):
+    screen.set_viewport_size({"width": 1600, "height": 900})
+    box = screen.locator(".next").bounding_box()
+    assert box["y"] + box["height"] < 850
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_chart_of_rivals_has_a_line_and_an_expectation_of_each(screen, count):
+    """Over the dots of the first; expectations that part are not said to part elsewhere."""
+    plot = screen.evaluate(
+        """count => {
+          const why = JSON.parse(document.getElementById("screen-data").textContent).why;
+          const rivals = ["a", "b", "c"].slice(0, count).map(effect => ({ effect, why: { ...why, unit: "N m" } }));
+          const expected = rivals.map((r, k) => ({ effect: r.effect, value: 0.1 * k, sigma: 0.01 }));
+          return duelPlot(rivals, { at: 708, sigma: 0.01, expected }, null, 1e3);
+        }""",
+        count,
+    )
+    kinds = [series["kind"] for series in plot["spec"]["series"]]
+    assert plot["title"].startswith({2: "Two", 3: "Three"}[count]) and "other directions" not in plot["title"]
+    assert kinds.count("line") == count and kinds.count("dots") == count + 1
+    assert plot["spec"]["stripe"]["said"].replace("\u00a0", " ") == "measure here: 708 N m"
+
+
 def test_a_dot_shows_its_view_and_again_all(screen, diagnosed_page):
     dot = screen.locator("[data-why] .dot").nth(2)
     dot.press("Enter")
