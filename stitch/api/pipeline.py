@@ -376,7 +376,11 @@ class _Conductor:
         self._screened = Event()
 
     def fit(self, sessions: Sequence[SessionData], measurements: Sequence[Measurement]) -> FittedRig:
-        """Fit the views that are left, tell the recorders where these are fewer, and begin to register and to fuse."""
+        """Return the fit of the views that are left, and begin to register and to fuse them beside the screening.
+
+        What was begun before, of more views, is ended. Recorders are shown what runs beside only once it is wanted:
+        until then a memory stands for each, and fusion waits until the screening has left all views in.
+        """
         self.close()
         for whole, session, recorder in zip(self._sessions, sessions, self._recorders, strict=True):
             if len(session.views) < len(whole.views):

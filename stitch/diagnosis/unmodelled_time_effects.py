@@ -147,7 +147,10 @@ def unmodelled_log_posterior(base: LinearModel) -> float:
 
 
 def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProcess:
-    """Return the likeliest of swings with periods between those that were tried, beside the fitted variances."""
+    """Return the likeliest of the swings whose periods lie between those that were tried next to this one.
+
+    They are compared at the variances of its fit; the likeliest is fitted with variances of its own.
+    """
     frequency = swing.process.frequency
     assert frequency is not None
     time = time_in_steps(base.measurement)

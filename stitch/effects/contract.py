@@ -309,7 +309,13 @@ class _AtScanner:
     scanner: str
 
     def __call__(self, known: Any, view: Any = None, **arguments: Any) -> Any:
-        """Return what the place asks for: of `known` views twists, or points of one view."""
+        """Return what the effect does in the views of its scanner, and nothing in others.
+
+        Args:
+            known: all views, of which an effect of the mount gives twists (V, 6); or points (N, 3) of one view, which
+                an effect of the sensor moves.
+            view: whose points they are.
+        """
         views = known if self.place == "mount" else view.views
         own = views.scanners.names.index(self.scanner)
         has_it = views.scanners.of_view == own
@@ -382,7 +388,7 @@ def find_effect(name: str) -> Effect:
 
 
 def of_each_scanner(views: Views, effects: Iterable[Effect]) -> list[Effect]:
-    """Return effects; of several scanners, what one may have by itself for each of them."""
+    """Return effects, where there are several scanners those of sensor and mount once for each, as effect@scanner."""
     names = views.scanners.names
     return [
         each
@@ -500,7 +506,10 @@ def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list
 
 
 def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return the smallest parts that can be true without the others."""
+    """Return the smallest groups of parameters, by their indices, of which one can be true without the others.
+
+    A row of a table by itself, the parameters of one joint, or else all.
+    """
     if effect.place == "links" or effect.tier == "empirical":
         # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
         return [[i] for i, p in enumerate(parameters) if not p.grid]

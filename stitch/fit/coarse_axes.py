@@ -164,12 +164,17 @@ class _Motions:
         return frames.inverse(T) if self.to_hand else T
 
     def residual(self, axes: Axes, placement: Array, T_mount: Array) -> Array:
-        """(P, 6) of the motions, as displacements of the part."""
+        """Return how far the scans moved otherwise (P, 6) than axes and hand-eye foretell: twists, turns at the part.
+
+        Args:
+            placement: (K, 6) twists by which the axes stand elsewhere.
+            T_mount: (4, 4) hand-eye.
+        """
         motion = AxisMotion(axes.readings, placement, np.zeros((len(axes.axes), 3)), axes.as_read().error)
         T = axes.carried(motion) @ self.reported
         pose = (frames.inverse(T) if self.to_hand else T) @ T_mount
-        told = frames.inverse(pose[self.pairs[:, 0]]) @ pose[self.pairs[:, 1]]
-        return frames.log(frames.inverse(self.scanner) @ told) * np.repeat([self.size, 1.0], 3)
+        foretold = frames.inverse(pose[self.pairs[:, 0]]) @ pose[self.pairs[:, 1]]
+        return frames.log(frames.inverse(self.scanner) @ foretold) * np.repeat([self.size, 1.0], 3)
 
 
 def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
@@ -272,7 +277,10 @@ def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted:
 
 
 def _refined(motions: _Motions, axes: Axes, T_mount: Array) -> tuple[Axes, Array]:
-    """Return axes and hand-eye after robust least squares of all that is unknown."""
+    """Return axes and hand-eye after robust least squares of all that is unknown.
+
+    A rotary axis errs by tilts and shifts across it, numbers 0, 1, 3 and 4 of its placement; a linear one by tilts.
+    """
     free = [
         (k, i)
         for k, axis in enumerate(axes.axes)
@@ -295,6 +303,6 @@ def _refined(motions: _Motions, axes: Axes, T_mount: Array) -> tuple[Axes, Array
         f_scale=_SHARE / 3 * motions.size,
         max_nfev=60,
     )
-    placement, T = moved(fit.x)
+    placement, T_refined = moved(fit.x)
     motion = replace(axes.as_read(), placement=placement)
-    return replace(axes, axes=axes.placed(motion)), T
+    return replace(axes, axes=axes.placed(motion)), T_refined

@@ -98,7 +98,11 @@ def support_note(dropped: Unsupported) -> str:
 
 
 def target_sentence(targets: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
-    """Return the residual at the targets, the noise floor, and the scatter of the poses."""
+    """Return the residual at the targets, the noise floor, and the scatter of the poses, in sentences.
+
+    Args:
+        registered: rms after single views were registered, length_unit.
+    """
     floor = targets.noise_floor
     left, out, noise = (length_text(x, length_unit, 4) for x in (targets.rms, targets.heldout_rms, floor))
     if targets.uninformative:

@@ -127,7 +127,7 @@ def _rim(triangles: Indices) -> Indices:
 
 
 def _without_pinches(triangles: Indices) -> Indices:
-    """Return the triangles without those at which two openings meet in one vertex: no fan closes both."""
+    """Return triangles (M, 3) of vertices without those at a vertex where two openings meet: no fan closes both."""
     while len(triangles):
         pinched = np.bincount(_rim(triangles)[:, 0], minlength=triangles.max() + 1) > 1
         if not pinched.any():

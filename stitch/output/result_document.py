@@ -344,6 +344,9 @@ def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
 def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[dict[str, Any], ModelFile]]:
     """Return result and model of each scanner among several by the name of its session: what another run of it needs.
 
+    From those of all are taken the scanner's own hand-eye, the effects that it has by itself or with all, and its
+    views; what only all together have, as the covariance of effects, is left away.
+
     Args:
         whole: result.json of all.
     """
@@ -351,7 +354,7 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
     documents = {}
     for k, (part, row) in enumerate(zip(run.session.parts, whole["scanners"], strict=True)):
         name = part.scanner.name
-        mine = {
+        effects = {
             effect.removesuffix(f"@{name}"): parameters
             for effect, parameters in common.effects.items()
             if effect != SCANNER_PLACEMENT and effect.partition("@")[2] in ("", name)
@@ -362,15 +365,15 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
             T_mount=place.T_mount,
             T_mount_coarse=place.T_mount if part.scanner.T_mount is None else part.scanner.T_mount,
             covariance=place.covariance,
-            effects=mine,
+            effects=effects,
             effects_covariance=EffectsCovariance(),
             scanners={},
         )
-        own = {
+        own_entries = {
             "session": str(part.path.resolve()),
             "name": part.name,
             "hand_eye_coarse": plain(model.T_mount_coarse),
-            "effects": {e: {p: parameter_row(value) for p, value in table.items()} for e, table in mine.items()},
+            "effects": {e: {p: parameter_row(value) for p, value in table.items()} for e, table in effects.items()},
             "hand_eye_stated": False,
             **{key: value for key, value in row.items() if key not in ("session", "alone", "U")},
             "views": _own_rows(whole["views"], name),
@@ -378,8 +381,8 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
             "linkage": {},
             "stock": _own_rows(whole.get("stock", []), name),
         }
-        left = ("sessions", "scanners", "effects_covariance", "hand_eye_sigma_anywhere")
-        documents[part.name] = ({k: v for k, v in whole.items() if k not in left} | own, model)
+        of_all = ("sessions", "scanners", "effects_covariance", "hand_eye_sigma_anywhere")
+        documents[part.name] = ({k: v for k, v in whole.items() if k not in of_all} | own_entries, model)
     return documents
 
 

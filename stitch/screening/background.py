@@ -157,7 +157,13 @@ def find_static_background(
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
-    """Return views between which and view v the model moves its points before the scanner, all over the session."""
+    """Return views before whose scanner the model has the points of view v far from where v saw them.
+
+    Args:
+        points: (n, 3) of view v, scanner frame.
+        poses: (V, 4, 4) T_reference_scanner by the model.
+        size: of the part, length_unit: a share of it is far enough.
+    """
     if not len(points):
         return []
     there = frames.transform(frames.inverse(poses) @ poses[v], points[None])

@@ -51,9 +51,13 @@ class FewViews:
 def weigh_few_views(
     measurement: Measurement, hand_eye: Model, unconstrained: UnconstrainedPoses, model: ViewModel
 ) -> FewViews:
-    """Return the odds that a view is off, against what ordinary arms leave.
+    """Return the odds that one of few views is off, against what ordinary arms leave.
+
+    Each view is displaced in turn, by several sizes, and the evidence of the poses with that is held against their
+    evidence without: under usual errors of the arm, scatter, and errors of the scanner, whose sizes are integrated.
 
     Args:
+        hand_eye: with effects in use; the arm errs beside these.
         model: of what the unconstrained views say.
     """
     errors = prior_pose_errors([measurement], hand_eye, [model.centre]).of_ordinary_arm.project(model.reduced.reduction)

@@ -55,7 +55,14 @@ def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
 
 
 def _most_stepped_targets(places: Array, sigma: float) -> list[tuple[int, int]]:
-    """Return the targets (V, K, 3) of which means before and after some view differ most, and that view."""
+    """Return the targets that seem to have moved, likeliest first, each with the view from which on it lies elsewhere.
+
+    A target moves if its distances from the others differ, before and after some view, by more than their scatter.
+
+    Args:
+        places: (V, K, 3) of the targets in each view, NaN where it does not show one.
+        sigma: of a distance, length_unit, as the sensor states it: the least that is taken for the scatter.
+    """
     count = places.shape[1]
     some = np.linspace(0, count - 1, min(count, COMPARED_TARGETS)).astype(int)
     typical = []

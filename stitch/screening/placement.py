@@ -192,7 +192,10 @@ def starts_about(T: Array, scan: Scan, size: float) -> Array:
 
 
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
-    """Return the share of a scan on the surface of the others at which it counts as placed."""
+    """Return the share of a scan on the surface of the others at which it counts as placed.
+
+    A fixed share of what is usual: of linked views, some of which are held against the others where they are.
+    """
     core = linked.core
     if not linked.unlinked or len(core) < 2:
         return _ACCEPTED_CLOSURE

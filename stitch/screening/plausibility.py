@@ -51,11 +51,11 @@ def beyond_effects(session: SessionData, rotation: float, translation: float) ->
 
 def apply_displacement_limits(session: SessionData, snooping: Snooping) -> Snooping:
     """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
-    sure = [m for m in snooping.suspected if beyond_effects(session, *m.at_least)]
+    beyond = [m for m in snooping.suspected if beyond_effects(session, *m.at_least)]
     return replace(
         snooping,
-        misplaced=tuple(sorted((*snooping.misplaced, *sure), key=lambda m: m.view)),
-        suspected=tuple(m for m in snooping.suspected if m not in sure),
+        misplaced=tuple(sorted((*snooping.misplaced, *beyond), key=lambda m: m.view)),
+        suspected=tuple(m for m in snooping.suspected if m not in beyond),
     )
 
 

@@ -86,7 +86,7 @@ def has_converged(g: Gram, step: Array, share: float) -> bool:
 
 
 def is_last_step(g: Gram, step: Array, last: LastStep, share: float) -> bool:
-    """True if this step (V, 6) leaves another that converges, as the ratio of the last two foretells.
+    """Return whether the step (V, 6) after this one converges, as the ratio of this one to the last foretells.
 
     Then nothing is to be learnt from new partners: the step is taken, and those at hand are carried along.
     """
@@ -125,7 +125,7 @@ def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
 
 
 def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = None) -> float:
-    """Rms of (p − q)·n for perfect poses: √(σ_v² + σ_w²) over all correspondences.
+    """Return the rms (length_unit) that noise leaves between surfaces at perfect poses: √(σ_v² + σ_w²) over all pairs.
 
     σ of each view is measured in its own scan, across local quadrics; where the scans are too small
     for that, `stated` (scanner.noise of the session) stands in. Noise cannot leave more than what was left

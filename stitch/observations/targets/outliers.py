@@ -175,26 +175,28 @@ def drop_mislabelled(sightings: Sightings | None) -> Sightings | None:
 
 
 def _distance_deviations(places: Array) -> tuple[Array, float]:
-    """Return by how much a distance of each view (V,) is off what it usually is, at the most, and the median of all.
+    """Return for each view (V,) how far a distance between two of its targets is off its median over the views.
+
+    The largest of each view, length_unit; and the median of all deviations, which is what is usual.
 
     Args:
         places: (V, K, 3) of the targets, NaN where a view does not show one; of many that it shows some are compared.
     """
-    worst, off = np.zeros(len(places)), [np.zeros(0)]
-    alike = defaultdict[tuple[int, ...], list[int]](list)
+    largest, all_deviations = np.zeros(len(places)), [np.zeros(0)]
+    views_by_targets = defaultdict[tuple[int, ...], list[int]](list)
     for v, place in enumerate(places):
         shown = np.flatnonzero(np.isfinite(place[:, 0]))
         some = np.linspace(0, len(shown) - 1, min(len(shown), COMPARED_TARGETS)).astype(int)
-        alike[tuple(shown[some])].append(v)
-    for targets, views in alike.items():
+        views_by_targets[tuple(shown[some])].append(v)
+    for targets, views in views_by_targets.items():
         if len(targets) >= _MIN_TARGETS:
-            apart = target_distances(places[:, list(targets)])[:, *np.triu_indices(len(targets), 1)]
-            few = np.isfinite(apart).sum(axis=0) < _MIN_VIEWS
-            deviations = np.where(few, np.nan, np.abs(apart[views] - nan_median(apart)))
-            worst[views] = np.nanmax(deviations, axis=1, initial=0.0)
-            off.append(deviations.ravel())
-    every = np.concatenate(off)
-    return worst, float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
+            distances = target_distances(places[:, list(targets)])[:, *np.triu_indices(len(targets), 1)]
+            few = np.isfinite(distances).sum(axis=0) < _MIN_VIEWS
+            deviations = np.where(few, np.nan, np.abs(distances[views] - nan_median(distances)))
+            largest[views] = np.nanmax(deviations, axis=1, initial=0.0)
+            all_deviations.append(deviations.ravel())
+    every = np.concatenate(all_deviations)
+    return largest, float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
 
 
 def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterator[list[int]]:
