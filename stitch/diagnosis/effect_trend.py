@@ -55,6 +55,8 @@ _POINT_AXES = {
     "intensity_bias": ("intensity, in standard deviations", ""),
     "part_sag": ("height above the clamp", None),
 }
+# What else moves as a whole, by the place of its effects.
+_BODIES = {"part": "the part", "base": "the robot's base", "axis": "the external axis"}
 _CONSTANT = Effect(
     "constant",
     "mount",
@@ -469,7 +471,7 @@ def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
         length = max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
         return _Motion("the scanner's mount", unit, columns / length, response, twist=along / length)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
-    of = {"part": "the part", "base": "the robot's base"}.get(term.effect.place, "the arm")
+    of = _BODIES.get(term.effect.place, "the arm")
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
 
 

@@ -311,6 +311,12 @@ def test_a_click_on_the_part_tells_the_place_before_and_after(screen):
     assert float(after) == pytest.approx(float(before) / 2, rel=0.02)
 
 
+def test_a_click_on_the_worst_places_number_brings_it_into_sight(screen):
+    screen.locator("[data-tile=worst]").click()
+    screen.locator("[data-now] .tag-text", has_text="worst").wait_for()
+    assert "out of sight" not in screen.locator("[data-beyond]").inner_text()
+
+
 def test_both_parts_turn_together(screen):
     before = [screen.locator(f"[data-{side}] canvas").screenshot() for side in ("now", "then")]
     screen.locator("[data-now] canvas").press("ArrowLeft")

@@ -102,7 +102,8 @@ function showScreen(root, part, found, um) {
     const errors = part.sigma ? Float32Array.from(part.sigma).filter(Number.isFinite).sort() : [], least = allowed - 2 * (errors[errors.length >> 1] || 0);
     const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.floor(100 * seen.filter(v => v <= least).length / Math.max(seen.length, 1)); });
     const worst = Math.max(0, ...both.flatMap(s => Array.from(s.values).filter(Number.isFinite))), beyond = at("beyond"), hatched = at("hatched");
-    if (beyond) beyond.textContent = worst > full ? `The darkest colour begins at ${roundLength(full)}; the worst place has ${roundLength(worst)}.` : "";
+    const said = [worst > full && `The darkest colour begins at ${roundLength(full)}; the worst place has ${roundLength(worst)}.`, !tags.some(t => t.patch === worstPatch(present().values)) && "The worst place of now is out of sight; a click on its number turns the part to it."];
+    if (beyond) beyond.textContent = said.filter(Boolean).join(" ");
     if (hatched) hatched.hidden = !views.some(v => v.hatched());
     const told = at("within");
     if (told) told.textContent = allowed ? `Within ${shortLength(allowed)}: ${within[0]} % → ${within[1]} %` : "";
@@ -250,7 +251,10 @@ function partStage(card, data, index) {
       const i = vertexOf(patch);
       if (i < 0) return;
       const [x, y, z] = [0, 1, 2].map(k => normals[3 * i + k]);
-      look.set({ ...look.now(), yaw: -Math.atan2(x, z), pitch: Math.atan2(y, Math.hypot(x, z)), panX: 0, panY: 0 }); draw();
+      look.set({ ...look.now(), yaw: -Math.atan2(x, z), pitch: Math.atan2(y, Math.hypot(x, z)), panX: 0, panY: 0 });
+      // Turned, the part may be higher than the picture.
+      const [panX, panY] = project(i).slice(0, 2).map(v => Math.max(-0.85, Math.min(0.85, v)) - v);
+      look.set({ ...look.now(), panX, panY }); draw();
     },
     hatched: () => state.hatched,
     show(values, full, signed) {
