@@ -102,7 +102,7 @@ function showScreen(root, part, found, um) {
     const errors = part.sigma ? Float32Array.from(part.sigma).filter(Number.isFinite).sort() : [], least = allowed - 2 * (errors[errors.length >> 1] || 0);
     const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.floor(100 * seen.filter(v => v <= least).length / Math.max(seen.length, 1)); });
     const worst = Math.max(0, ...both.flatMap(s => Array.from(s.values).filter(Number.isFinite))), beyond = at("beyond"), hatched = at("hatched");
-    const said = [worst > full && `The darkest colour begins at ${roundLength(full)}; the worst place has ${roundLength(worst)}.`, !tags.some(t => t.patch === worstPatch(present().values)) && "The worst place of now is out of sight; a click on its number turns the part to it."];
+    const said = [worst > full && `The darkest colour begins at ${roundLength(full)}; the worst place has ${roundLength(worst)}.`, !tags.some(t => t.patch === worstPatch(present().values)) && "The worst place now is out of sight; a click on its number turns the part there."];
     if (beyond) beyond.textContent = said.filter(Boolean).join(" ");
     if (hatched) hatched.hidden = !views.some(v => v.hatched());
     const told = at("within");
