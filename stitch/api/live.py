@@ -320,18 +320,18 @@ class LiveSession:
                 view, "It shares no surface with the others: its pose is far off, or it shows another part."
             )
         members = [*self._members, len(self.session.views) - 1]
-        off = self._blunders(fit, members)
-        if len(members) - 1 in off:
-            return self._rejected(view, off[len(members) - 1])
+        blunders = self._blunders(fit, members)
+        if len(members) - 1 in blunders:
+            return self._rejected(view, blunders[len(members) - 1])
         self._members = members
         self._fit = fit
-        for v in sorted(off, reverse=True):
+        for v in sorted(blunders, reverse=True):
             self._fit = without_view(self._fit, v)
             self._members = self._members[:v] + self._members[v + 1 :]
         self._fit = fit_live_hand_eye(self._fit, self._errors)
-        others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in off.items())
+        others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in blunders.items())
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
-        idle = seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
+        idle = seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not blunders
         share = f"{100 * seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
         return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
@@ -382,8 +382,8 @@ class LiveSession:
         measurement = measurement_of(self._session_of(members), fit.capture)
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
         sure = find_blunders(model.with_usual(usual)).blunders
-        off = [v for v in search.blunders if v in sure]
-        sentences = {v: self._displacement(fit, model, search, v, [w for w in off if w != v]) for v in off}
+        blunders = [v for v in search.blunders if v in sure]
+        sentences = {v: self._displacement(fit, model, search, v, [w for w in blunders if w != v]) for v in blunders}
         return {v: sentence for v, sentence in sentences.items() if sentence is not None}
 
     def _displacement(

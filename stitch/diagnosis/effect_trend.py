@@ -213,8 +213,8 @@ def _clearest_joint(effect: "_Effect") -> "_Effect":
         return effect
 
     def squared_sigmas(joint: list[int]) -> float:
-        own = place[joint]
-        return float(change.values[own] @ np.linalg.pinv(change.covariance[np.ix_(own, own)]) @ change.values[own])
+        at = place[joint]
+        return float(change.values[at] @ np.linalg.pinv(change.covariance[np.ix_(at, at)]) @ change.values[at])
 
     clearest = max(joints, key=squared_sigmas)
     alone = np.where(np.isin(np.arange(len(term.values)), clearest) | term.gridded, term.values, 0.0)
@@ -331,9 +331,9 @@ def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change
     """
     white = linear.whiten(columns)
     absorbed = np.column_stack([fit_columns(linear.white_design, column) for column in white.T]).astype(float)
-    own = beside.residual(columns)
+    residual = beside.residual(columns)
     values = fit_columns(linear.residual(columns), linear.white_residual)
-    covariance = np.linalg.pinv(own.T @ own).astype(float)
+    covariance = np.linalg.pinv(residual.T @ residual).astype(float)
     return _Change(columns - linear.reduce(linear.design) @ absorbed, values, covariance)
 
 

@@ -187,10 +187,10 @@ def _each_its_own(
     linears: Sequence[LinearModel], tried: Sequence[Sequence[Candidate]], scores: dict[str, list[Score]]
 ) -> dict[str, float]:
     """Return the log posteriors of effects and laws of which every session has numbers of its own."""
-    found = dict[str, float]()
+    log_posteriors = dict[str, float]()
     for name, of in scores.items():
         prior = float(np.log(limits.PRIOR_PHYSICAL * of[0].candidate.effect.prior / len(scores)))
-        found[name] = sum(scored.log_bayes_factor for scored in of) + prior
+        log_posteriors[name] = sum(scored.log_bayes_factor for scored in of) + prior
     laws = []
     for linear, candidates in zip(linears, tried, strict=True):
         dictionary = dictionary_of(linear, candidates)
@@ -199,8 +199,8 @@ def _each_its_own(
     for key, first in laws[0].items():
         if all(key in of_session for of_session in laws):
             others = sum(of_session[key].score.log_bayes_factor for of_session in laws[1:])
-            found[law_of(first).words] = first.log_posterior + others
-    return found
+            log_posteriors[law_of(first).words] = first.log_posterior + others
+    return log_posteriors
 
 
 def _grows_with_load(parameters: Sequence[Parameter]) -> bool:

@@ -40,8 +40,9 @@ from stitch.system.threads import parallel
 
 # Where a hand-eye came from that was not searched.
 STATED, REUSED, ALONE = "given in session.toml", "of another run, used as it is", "of each scanner's own views"
-# First gate of the search and truncation of the score, as shares of the part's size.
-COARSE_GATE, SCORE_SHARE = 0.35, 0.05
+# First gate of the search, that of the correction from what it found, and truncation of the score: shares of the part's
+# size.
+COARSE_GATE, _FOUND_GATE, SCORE_SHARE = 0.35, 0.2, 0.05
 # Points of a view that are asked for their nearest neighbours while a hand-eye is searched.
 SEARCH_SAMPLES = 120
 _SEARCH_POINTS = 2000
@@ -137,7 +138,7 @@ def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
     # Starts were turned about the part, which carries the scanner along: a shift that nothing shows ends at zero.
     tried = [replace(c, T_mount=_without_hidden_shift(captures, c.T_mount)) for c in tried]
     answers = distinct_hand_eyes(captures, tried, size)
-    return CoarseHandEye(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
+    return CoarseHandEye(answers[0].T_mount, _FOUND_GATE * size, answers[0].source, tuple(answers))
 
 
 def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
@@ -229,8 +230,8 @@ def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Arr
     """Return whether two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
     centre = scanner_centre(captures)
     corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
-    off = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
-    return bool(off.max() < _SAME_SHARE * size)
+    displacement = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
+    return bool(displacement.max() < _SAME_SHARE * size)
 
 
 def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:

@@ -59,9 +59,9 @@ def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> l
     """
     base = [incidence(m, capture, poses) * density(m, capture) for m in matches]
     middle = [weighted_median(m.residual, b) for m, b in zip(matches, base, strict=True)]
-    off = [m.residual - mu for m, mu in zip(matches, middle, strict=True)]
-    scale = mad_sigma(np.concatenate(off))
-    return [b * tukey(e, class_scale(e, scale)) for b, e in zip(base, off, strict=True)]
+    centred = [m.residual - mu for m, mu in zip(matches, middle, strict=True)]
+    scale = mad_sigma(np.concatenate(centred))
+    return [b * tukey(e, class_scale(e, scale)) for b, e in zip(base, centred, strict=True)]
 
 
 def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:

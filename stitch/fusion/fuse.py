@@ -59,7 +59,7 @@ class RegisteredSession:
     session: SessionData
     measurement: Measurement  # with the effects in use
     model: Model
-    own: Capture  # without them
+    capture: Capture  # without them
     poses: Array  # (V, 4, 4) T_reference_scanner
 
     @cached_property
@@ -77,14 +77,14 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
     """
-    scans = registered.own.scans
+    scans = registered.capture.scans
     T_part = part_axes(scans, registered.poses)
     poses = frames.inverse(T_part) @ registered.poses
     registered = replace(registered, poses=poses)
     cell = float(np.median([scan.scanned_spacing for scan in scans]))
     whole = has_whole_clouds(registered.session)
     # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
-    place = float(np.sqrt(np.median([np.median(scan.area) for scan in scans]))) if whole else registered.own.spacing
+    place = float(np.sqrt(np.median([np.median(scan.area) for scan in scans]))) if whole else registered.capture.spacing
     placed = place_scans(scans, poses)
     support = find_support(scans, poses, placed, place)
     if not whole:
@@ -255,7 +255,8 @@ def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab
         slab: points of a slab.
     """
     thickness = block * cell
-    clouds = [frames.transform(T, scan.points) for scan, T in zip(registered.own.scans, registered.poses, strict=True)]
+    placed = zip(registered.capture.scans, registered.poses, strict=True)
+    clouds = [frames.transform(T, scan.points) for scan, T in placed]
     low = np.min([points.min(axis=0) for points in clouds], axis=0)
     high = np.max([points.max(axis=0) for points in clouds], axis=0)
     axis = int(np.argmax(high - low))
@@ -290,7 +291,7 @@ class _ViewInSlabs:
         self.registered = registered
         self.v = v
         self.slabs = slabs
-        self.scan = registered.own.scans[v]
+        self.scan = registered.capture.scans[v]
         self.T = registered.poses[v]
         cloud = registered.session.views[v].cloud
         self.whole = None if cloud is None else cloud.whole
@@ -388,7 +389,7 @@ class _ViewInSlabs:
         """Return some of the points, scanner frame, without the effects in use."""
         registered, terms = self.registered, self.registered.model.terms
         scan, scale = registered.measurement.capture.scans[self.v], registered.intensity_scale
-        T = registered.own.poses(registered.model.T_mount)[self.v]
+        T = registered.capture.poses(registered.model.T_mount)[self.v]
         corrected = []
         for block in np.array_split(index, len(index) // _SLAB + 1):
             points = cloud.points[block]

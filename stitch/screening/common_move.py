@@ -136,9 +136,9 @@ class CommonMove:
     def _stepped(self) -> "CommonMove":
         """Return the move after one Gauss–Newton step of hand-eye and base: 12 unknowns, turns about middles."""
         p = self.sightings.points[self.view, self.slot]
-        middle = p.mean(axis=0)
-        there = self.in_base.mean(axis=0)
-        size = float(np.linalg.norm(p - middle, axis=1).mean()) or 1.0
+        centroid = p.mean(axis=0)
+        base_centroid = self.in_base.mean(axis=0)
+        size = float(np.linalg.norm(p - centroid, axis=1).mean()) or 1.0
         to_reference = (
             np.broadcast_to(np.eye(3), (len(p), 3, 3))
             if self.capture.scanner_rides
@@ -149,12 +149,12 @@ class CommonMove:
         carried = self.capture.T_reference_mount[self.view, :3, :3]
         to_base = of_base @ carried if self.capture.scanner_rides else of_base
         of_mount = to_reference @ to_base @ self.T_mount[:3, :3]
-        rows = [of_mount @ -frames.skew((p - middle) / size), of_mount]
-        rows += [moved * (to_reference @ -frames.skew((self.in_base - there) / size)), moved * to_reference]
+        rows = [of_mount @ -frames.skew((p - centroid) / size), of_mount]
+        rows += [moved * (to_reference @ -frames.skew((self.in_base - base_centroid) / size)), moved * to_reference]
         columns = self._centred(np.concatenate(rows, axis=2)).reshape(-1, 12)
         x = np.linalg.lstsq(columns, -self.rest.ravel(), rcond=1e-8)[0]
         turn = np.repeat([1 / size, 1.0], 3)
-        about, about_base = frames.make(np.eye(3), middle), frames.make(np.eye(3), there)
+        about, about_base = frames.make(np.eye(3), centroid), frames.make(np.eye(3), base_centroid)
         T_mount = self.T_mount @ about @ frames.exp(turn * x[:6]) @ frames.inverse(about)
         T = about_base @ frames.exp(turn * x[6:]) @ frames.inverse(about_base) @ self.T
         return CommonMove(self.capture, T_mount, T, self.start)

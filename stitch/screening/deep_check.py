@@ -200,9 +200,9 @@ def _depth_scale_fix(session: SessionData, scale: float) -> list[str]:
 
 def refuse(session: SessionData, problems: Sequence[SessionProblem]) -> None:
     """Raise what a deep check found; do nothing where it found nothing certain."""
-    for found in (p for p in problems if p.certain):
-        error = NoResultError if found.kind in KINDS_WITHOUT_A_CAUSE else InputError
-        raise error(f"{session.path}: the poses contradict what was measured: {found.line(session.names)}")
+    for certain in (p for p in problems if p.certain):
+        error = NoResultError if certain.kind in KINDS_WITHOUT_A_CAUSE else InputError
+        raise error(f"{session.path}: the poses contradict what was measured: {certain.line(session.names)}")
 
 
 def refuse_whole(session: SessionData) -> list[SessionProblem]:

@@ -42,18 +42,18 @@ def hand_eye_transfer(
     columns = view_columns(measurement, model, unconstrained)
     errors[_EFFECTS] = [columns @ model.effects_covariance.root(model.terms)]
     poses = prior_pose_errors([measurement], model, [unconstrained.overlaps.gram.centre])
-    shown = fit_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors, errors=poses)
-    turn, distance = hand_eye_difference(capture, model.T_mount, shown.T_mount)
-    xi = frames.log(frames.inverse(model.T_mount) @ shown.T_mount)
-    middle = _middle_of(capture)
-    covariance = model.covariance + shown.covariance
+    fitted = fit_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors, errors=poses)
+    turn, distance = hand_eye_difference(capture, model.T_mount, fitted.T_mount)
+    xi = frames.log(frames.inverse(model.T_mount) @ fitted.T_mount)
+    part_centre = _part_centre(capture)
+    covariance = model.covariance + fitted.covariance
     square = mahalanobis_square(xi, covariance)
     return HandEyeTransfer(
         turn=turn,
         distance=distance,
         ratio=float(np.sqrt(square / chi2_limit(0.05, 6))),
-        U=displacement(covariance, middle),
-        U_given=displacement(model.covariance, middle),
+        U=displacement(covariance, part_centre),
+        U_given=displacement(model.covariance, part_centre),
         p_value=chi2_tail(square, 6),
     )
 
@@ -61,7 +61,7 @@ def hand_eye_transfer(
 def hand_eye_difference(capture: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
     """Return the angle (rad) between two hand-eyes, and how far they put the middle of the part from each other."""
     xi = frames.log(frames.inverse(T_mount) @ other)
-    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], _middle_of(capture))))
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], _part_centre(capture))))
 
 
 def mahalanobis_square(difference: Array, covariance: Array) -> float:
@@ -70,7 +70,7 @@ def mahalanobis_square(difference: Array, covariance: Array) -> float:
     return float((difference * unit) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (difference * unit))
 
 
-def _middle_of(capture: Capture) -> Array:
-    """(3,) middle of what the views see, scanner frame."""
-    middle: Array = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
-    return middle
+def _part_centre(capture: Capture) -> Array:
+    """(3,) mean over the views of the centroids of their scans, scanner frame."""
+    centre: Array = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
+    return centre

@@ -60,9 +60,9 @@ def require_matching_hand_eye(
     fitted = fit_hand_eye([capture], [views], correction.model.T_mount)
     if not beyond_any_arm(session, *hand_eye_difference(capture, correction.model.T_mount, fitted.T_mount)):
         return
-    found = hand_eye_transfer(measurement, capture, views, correction.model)
-    if found.p_value < _HAND_EYE_CHANCE and beyond_any_arm(session, found.turn, found.distance):
-        by = f"{found.distance:.3g} {session.length_unit} and {1e3 * found.turn:.3g} mrad"
+    transfer = hand_eye_transfer(measurement, capture, views, correction.model)
+    if transfer.p_value < _HAND_EYE_CHANCE and beyond_any_arm(session, transfer.turn, transfer.distance):
+        by = f"{transfer.distance:.3g} {session.length_unit} and {1e3 * transfer.turn:.3g} mrad"
         raise NoResultError(f"{session.path}: {sentence('hand-eye of another set-up', by=by)}")
 
 
@@ -159,10 +159,10 @@ def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str,
     displaced = dict[str, float]()
     for name, k in known.items():
         other = there.model.targets[name]
-        apart = here.landmarks.positions[k] - other.position
+        difference = here.landmarks.positions[k] - other.position
         variance = sigmas[k] ** 2 + other.sigma**2
-        if chi2_tail(float(np.sum(apart**2 / np.maximum(variance, 1e-300))), 3) < _MODEL_CHANCE / 2 / len(known):
-            displaced[name] = float(np.linalg.norm(apart))
+        if chi2_tail(float(np.sum(difference**2 / np.maximum(variance, 1e-300))), 3) < _MODEL_CHANCE / 2 / len(known):
+            displaced[name] = float(np.linalg.norm(difference))
     return displaced
 
 
@@ -206,7 +206,7 @@ def view_mean_squares(fitted: FittedRig) -> Array:
     if fitted.correction is not None:
         every = zip(fitted.captures, fitted.correction.overlaps, strict=True)
         return np.concatenate([per_view_rms(overlaps, len(capture.scans)) ** 2 for capture, overlaps in every])
-    return np.concatenate([own.targets.view_squares for own in fitted.sessions if own.targets is not None])
+    return np.concatenate([session.targets.view_squares for session in fitted.sessions if session.targets is not None])
 
 
 def find_disagreeing_sessions(
@@ -251,14 +251,14 @@ def compare_with_own_effects(shared: Array, separate: Array, numbers: int) -> tu
     """
     seen = np.isfinite(shared) & np.isfinite(separate)
     views = max(int(seen.sum()), 1)
-    whole = float(shared[seen].sum())
-    own = float(separate[seen].sum())
+    shared_sum = float(shared[seen].sum())
+    separate_sum = float(separate[seen].sum())
     count = _NUMBERS_PER_VIEW * views
-    left = count - numbers - _NUMBERS_PER_SESSION
-    rms = np.sqrt(np.array([whole, own]) / views).tolist()
-    if not numbers or left <= 0:
+    degrees = count - numbers - _NUMBERS_PER_SESSION
+    rms = np.sqrt(np.array([shared_sum, separate_sum]) / views).tolist()
+    if not numbers or degrees <= 0:
         return [*rms, rms[0]], 1.0, False
-    p = f_tail(max((whole - own) / numbers / max(own / left, 1e-300), 0.0), numbers, left)
+    p = f_tail(max((shared_sum - separate_sum) / numbers / max(separate_sum / degrees, 1e-300), 0.0), numbers, degrees)
     expected = rms[1] * float(np.sqrt((count + numbers) / (count - numbers)))
     uncertain = max(_WORTH_A_TENTH, 2 / np.sqrt(2 * count))
     return [*rms, expected], p, rms[0] > (1 + uncertain) * expected

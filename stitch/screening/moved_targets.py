@@ -143,13 +143,13 @@ def _levels(distances: Array, start: int) -> Array:
 
 
 def _fitted_lines(distances: Array) -> Array:
-    """(V, p) straight lines through distances over the session, by least squares."""
+    """Return (V, p) straight lines over the order of the views, through p distances (V, p) that may be NaN."""
     seen = np.isfinite(distances)
     order = np.where(seen, np.arange(len(distances))[:, None], np.nan)
-    at = np.where(seen, order - np.nanmean(order, axis=0), 0.0)
-    middle = np.nanmean(distances, axis=0)
-    slope = np.sum(at * np.where(seen, distances - middle, 0.0), axis=0) / np.maximum(np.sum(at**2, axis=0), 1e-300)
-    return np.where(seen, middle + slope * at, np.nan)
+    time = np.where(seen, order - np.nanmean(order, axis=0), 0.0)
+    mean = np.nanmean(distances, axis=0)
+    slope = np.sum(time * np.where(seen, distances - mean, 0.0), axis=0) / np.maximum(np.sum(time**2, axis=0), 1e-300)
+    return np.where(seen, mean + slope * time, np.nan)
 
 
 def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:

@@ -298,7 +298,7 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
         rest = displaced - mean @ (mean.T @ displaced)
         return bool(np.linalg.norm(rest) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
 
-    saying = [v for v, own in enumerate(model.views) if says_more(own)]
+    saying = [v for v, response in enumerate(model.views) if says_more(response)]
     alone = dict(zip(saying, test_alternatives(under, [model.views[v] for v in saying]), strict=True))
     if not alone:
         return None

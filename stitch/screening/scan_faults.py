@@ -81,8 +81,8 @@ def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: floa
 
 def _moved(scan: Scan, T: Array, other: Array) -> float:
     """Return how far apart two poses put the middle of a scan."""
-    middle = scan.points.mean(axis=0)[None]
-    return float(np.linalg.norm(frames.transform(other, middle) - frames.transform(T, middle)))
+    centroid = scan.points.mean(axis=0)[None]
+    return float(np.linalg.norm(frames.transform(other, centroid) - frames.transform(T, centroid)))
 
 
 def _fit_scale(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> float:

@@ -267,20 +267,28 @@ class _Case:
         if sum(len(m.residual) for m in matches) < _FEWEST:
             return None
         columns = zip(*(m.columns for m in matches), strict=True)
-        middle, normal, e, weight, index, _ = (np.concatenate(column) for column in columns)
-        own = frames.plane_rows(middle - self.centre, normal)
+        midpoint, normal, residual, weight, index, _ = (np.concatenate(column) for column in columns)
+        view_rows = frames.plane_rows(midpoint - self.centre, normal)
         partner = np.repeat([m.w for m in matches], [len(m.residual) for m in matches])
-        rows = np.zeros((len(e), len(poses), 6))
-        rows[:, self.view] = own
-        rows[np.arange(len(e)), partner] -= own
+        rows = np.zeros((len(residual), len(poses), 6))
+        rows[:, self.view] = view_rows
+        rows[np.arange(len(residual)), partner] -= view_rows
         cosine = np.einsum("ni,ni->n", frames.rotate(poses[self.view], scan.normals[index]), normal)
-        return e, weight, index, cosine, rows.reshape(len(e), -1)
+        return residual, weight, index, cosine, rows.reshape(len(residual), -1)
 
 
 def _hold_against_others(
     capture: Capture, T_mount: Array, gate: float, view: int, off: Collection[int], usual: Array
 ) -> _Case | None:
-    """Free the other views, those near it where there are many, and say what they show of the robot's poses."""
+    """Return how a view lies to the others, freed from the robot's poses, under what those show of its scatter.
+
+    None where too few views are left.
+
+    Args:
+        gate: largest distance between partners, length_unit.
+        off: views that stand off: they take no part.
+        usual: (6,) by which poses of an arm usually err, rad and length_unit: scatter is no less than a share of it.
+    """
     poses = capture.poses(T_mount)
     middles = frames.transform(poses, np.array([[scan.points.mean(axis=0)] for scan in capture.scans]))[:, 0]
     near = np.argsort(np.linalg.norm(middles - middles[view], axis=1), kind="stable")

@@ -279,7 +279,7 @@ def session_warnings(
     snooping = _snoop_session(session, measurement, correction, index)
     capture = correction.captures[index]
     warnings = snooping_warnings(session, capture, snooping, correction.geometry.T_mount)
-    return (*of_targets, *(found.fix for found in stock_problems(session, capture)), *warnings)
+    return (*of_targets, *(problem.fix for problem in stock_problems(session, capture)), *warnings)
 
 
 def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:

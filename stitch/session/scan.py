@@ -172,8 +172,8 @@ def find_neighbourhoods(points: Array, picked: Indices | None = None) -> Neighbo
     """Return the neighbourhoods of all points of a scan, or of those that are picked."""
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points, leafsize=16)
-    own = points if picked is None or len(picked) == len(points) else points[picked]
-    distance, index = tree.query(own, k=min(_NEIGHBOURS, len(points)))
+    queried = points if picked is None or len(picked) == len(points) else points[picked]
+    distance, index = tree.query(queried, k=min(_NEIGHBOURS, len(points)))
     return Neighbourhoods(tree, index, np.array(distance[:, -1]), float(np.median(distance[:, 1])))
 
 
