@@ -72,5 +72,4 @@ def mahalanobis_square(difference: Array, covariance: Array) -> float:
 
 def _part_centre(capture: Capture) -> Array:
     """(3,) mean over the views of the centroids of their scans, scanner frame."""
-    centre: Array = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
-    return centre
+    return np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)

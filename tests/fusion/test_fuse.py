@@ -64,9 +64,9 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     whole = registered(session, measured, effect)
     # Standardised over the points in memory, and the model speaks of these: the same numbers on both sides.
     light = registered(thin_session(session, 1500)[0], measured, effect)
-    assert all(len(scan.points) == 1500 for scan in light.own.scans)
-    cell = float(np.median([scan.scanned_spacing for scan in light.own.scans]))
-    expected = fuse(whole.own, whole.poses, cell, part_axes(light.own.scans, light.poses))
+    assert all(len(scan.points) == 1500 for scan in light.capture.scans)
+    cell = float(np.median([scan.scanned_spacing for scan in light.capture.scans]))
+    expected = fuse(whole.capture, whole.poses, cell, part_axes(light.capture.scans, light.poses))
     found, _ = fuse_every_point(light, slab=4000)
     if effect == "intensity_bias":  # mean and spread of the points in memory are not quite those of all
         assert len(found.points) == pytest.approx(len(expected.points), rel=2e-3)
@@ -95,7 +95,7 @@ def test_the_number_of_slabs_does_not_matter(blade_capture, monkeypatch):
     reads, read = [], WholeCloud.read
     monkeypatch.setattr(WholeCloud, "read", lambda whole: reads.append(whole.scan.name) or read(whole))
     one, many = (fuse_every_point(light, slab=slab)[0] for slab in (10**9, 1500))
-    assert len(reads) < 3 * len(light.own.scans)
+    assert len(reads) < 3 * len(light.capture.scans)
     monkeypatch.setattr("stitch.fusion.fuse._AHEAD", 2)
     often, _ = fuse_every_point(light, slab=1500)
     for name in ("points", "normals", "residual", "count"):
