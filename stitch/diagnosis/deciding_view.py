@@ -384,7 +384,12 @@ class _FurtherScans:
         return columns[self.before :] - np.tile(mean, ((len(columns) - self.before) // 6, 1))
 
     def covariance(self, base: LinearModel, unnamed: JointEffect | None) -> Array:
-        """(6 (V + N), 6 (V + N)) of the twists by what poses err, and a joint without a law."""
+        """Return the covariance (6 (V + N), 6 (V + N)) of the twists of V views and N further ones by errors of poses.
+
+        Args:
+            base: whose variances they have.
+            unnamed: a joint that errs by no known law beside them.
+        """
         variances = base.null.variances
         n = 6 * len(self.flange)
         blocks = np.zeros((len(self.flange), 6, len(self.flange), 6))
@@ -408,7 +413,7 @@ class _FurtherScans:
         return every.twist_covariance(same)
 
     def noise(self, base: LinearModel) -> Array:
-        """(6, 6) by which the surfaces put a view where it is not: as of the views that there are."""
+        """Return the covariance (6, 6) of a further view's twist by noise of the surfaces: the mean of those so far."""
         expansion = self.surfaces.reduced_poses.expansion
         noise = base.mixed.components[NOISE, 0] * base.null.variances[NOISE]
         if base.mixed.fixed is not None:
@@ -460,7 +465,10 @@ def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _Fur
 
 
 def _used_columns(linear: LinearModel, scans: _FurtherScans) -> Array:
-    """(6 (V + N), a − 6) of effects in use; further views answer only to what moves poses."""
+    """Return how the twists of views and further ones answer to the effects in use, (6 (V + N), a − 6).
+
+    Columns of the fit are found again among those of each effect; further views answer only to what moves poses.
+    """
     design = linear.design[:, 6:]
     out = np.vstack([design, np.zeros((6 * len(scans.flange) - len(design), design.shape[1]))])
     for term in linear.model.terms:

@@ -271,8 +271,11 @@ class _HalfEvidence:
 
 
 def objection_in_halves(scored: Score) -> str | None:
-    """Say what halves of the views speak against the best form of a candidate that explains much; None where nothing,
-    and where pose errors have no prior."""
+    """Return what halves of the views say against a candidate, in words: None where nothing.
+
+    Its best form is fitted in either half. It has to help in the other half, on average over several ways to halve,
+    and both halves have to show the same size. Asked only where pose errors have a prior.
+    """
     base = scored.base_model
     if base is None or base.observation.numbers_per_view is not None:
         return None

@@ -156,7 +156,7 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
 
 
 def _last_step(g: Gram) -> Array:
-    """(6,) twist of the last view that brings it onto the others, in the directions that they show."""
+    """Return the left twist (6,), about the centre, that brings the last view onto the others where they hold it."""
     unit = g.displacement_factors
     values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
     keep = values > NEAR_NULL * values[-1]

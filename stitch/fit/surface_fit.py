@@ -185,7 +185,10 @@ class LinearisedSurfaces:
 
     @property
     def _is_gauge(self) -> Mask:
-        """(P,) places of axes where no robot says how their common frame stands: what is not fitted is free."""
+        """(P,) parameters that place axes, where no robot says how their common frame stands.
+
+        Of these some are not fitted, since they move all together: that choice is free, and hides nothing.
+        """
         is_free = any(m.views.axes and not m.views.axes.has_robot for m in self.measurements)
         return np.array(
             [
@@ -235,7 +238,10 @@ def _free_views(
 
 
 def _model_rms(unconstrained: Sequence[UnconstrainedPoses]) -> float:
-    """What a model leaves between the surfaces, from the correspondences of the free-network poses."""
+    """Return the weighted rms distance (length_unit) that a model leaves between the surfaces of all sessions.
+
+    By the correspondences of the free-network poses, with the views moved back to where the model has them.
+    """
     squares = 0.0
     weights = 0.0
     for f in unconstrained:
@@ -246,7 +252,12 @@ def _model_rms(unconstrained: Sequence[UnconstrainedPoses]) -> float:
 
 
 def _final_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
-    """Correspondences of the model's own poses; the gate follows what they leave."""
+    """Return the overlaps at the poses of the model, matched once more within the gate that these leave.
+
+    Args:
+        T_mount: (4, 4) hand-eye.
+        gate: largest distance between partners at first, length_unit.
+    """
     samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     poses = capture.poses(T_mount)
     overlaps = collect_overlaps(capture, poses, gate, samples)

@@ -214,7 +214,7 @@ class LinearisedTargets:
 
     @cached_property
     def _starting_variances(self) -> Array:
-        """(3,) variances from which any search begins: of the step before, or where all effects take what they can."""
+        """(3,) variances from which a search begins: of the step before, or those that remain beside all effects."""
         if self.start is not None:
             return self.start
         everything = np.concatenate([self.base, self.columns], axis=2)

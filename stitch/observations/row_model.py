@@ -88,7 +88,14 @@ class ReducedRows(Observation):
         return np.linalg.pinv(self.reduction.reduce_twists(self.rows.lever[..., 3:])[:V]).astype(float)
 
     def mixed_model(self, A: Array) -> MixedModel:
-        """Numbers as blocks for the variance components; `A` (C, d, a) are the columns of the free mean."""
+        """Return the reduced observations as C blocks of d numbers, with their variance components.
+
+        Components are rotation and translation scatter of the flange, and the sensor's noise. Landmarks that the
+        reduction has taken out leave as many numbers fewer that err independently.
+
+        Args:
+            A: (C, d, a) columns of the free mean.
+        """
         rows, reduction = self.rows, self.reduction
         noise, fixed = reduction.present
         scattered = [reduction.reduce_twists(moved) for moved in rows.scattered]

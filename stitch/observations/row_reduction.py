@@ -40,7 +40,7 @@ class RowReduction:
         return views - (-(len(self.beyond) + int(self.known.sum())) // size)
 
     def reduce(self, rows: Array) -> Array:
-        """Return numbers (C, d, P) of rows (B, m, P)."""
+        """Return reduced numbers (C, d, P) of rows (B, m, P): by view, of views together, and of known variance."""
         views = len(self.of_views)
         white = self.per_sigma[..., None] * rows
         own = flatten_blocks(self.of_views @ white[:views])

@@ -85,7 +85,7 @@ def _evenly(views: Sequence[int], count: int) -> list[int]:
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
-    """(n,) points in the frame of a scan all about whose direction what it sees is farther away.
+    """Return which points (n, 3), frame of a scan, it looks past: all about their direction what it sees is farther.
 
     One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
     Where that face is too steep to be seen, there are looks on one side of the point alone.
@@ -174,7 +174,14 @@ def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> li
 def _under_model(
     scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, probes: tuple[int, Indices], tolerance: float
 ) -> tuple[Mask, Mask]:
-    """(n,) (n,) points of a view that another shows where the model has them, and that another looks through there."""
+    """Return which points (n,) of a view some other view shows where the model has them, and which one looks past.
+
+    Args:
+        looks: by view a tree of the directions in which it sees.
+        poses: (V, 4, 4) T_reference_scanner by the model.
+        probes: the view, and the points of it that are asked.
+        tolerance: distance that is the same place, length_unit.
+    """
     v, index = probes
     on_part = np.zeros(len(index), bool)
     through = np.zeros(len(index), bool)
@@ -222,7 +229,13 @@ def _bounding_box(points: Array) -> Array:
 
 
 def _box_beyond_part(part: Array, other: Array, every: Array, size: float) -> Array | None:
-    """(2, 3) the box of everything, widened, less what lies beyond the side that parts best."""
+    """Return the box (2, 3) of everything, cut off between the part and what else there is; None if no side parts them.
+
+    Args:
+        part, other: (n, 3) points of either.
+        every: (2, 3) box of all points.
+        size: of the part, length_unit: by that the box is widened.
+    """
     if not len(part):
         return None
     box = every + size * np.array([[-1.0], [1.0]])
@@ -232,7 +245,7 @@ def _box_beyond_part(part: Array, other: Array, every: Array, size: float) -> Ar
     side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
     if gaps[side, axis] < _GAP * size:
         return None
-    # Nearer to what stands still: between the probes the part may reach farther.
+    # Four fifths of the way to what stands still: between the probes the part may reach farther.
     near, far = (low[axis], other_high[axis]) if side == 0 else (high[axis], other_low[axis])
     box[side, axis] = 0.2 * near + 0.8 * far
     return box

@@ -142,7 +142,7 @@ def _centroid_residual(poses: Array, X: Array, centroids: Array, share: Array) -
 
 
 def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
-    """(P, 3) that brings the centroids closest together while the rotations stay."""
+    """Return shifts (P, 3) of the hand-eyes X that bring the centroids closest together while the rotations stay."""
     R = poses[..., :3, :3]
     M = R - np.einsum("pv,pvij->pij", share, R)[:, None]
     r = _centroid_residual(poses, X, centroids, share)
@@ -152,7 +152,15 @@ def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) ->
 
 
 def _centroid_step(poses: Array, X: Array, centroids: Array, share: Array, damping: Array) -> Array:
-    """(P, 6) right twists of the hand-eyes."""
+    """Return a damped Gauss–Newton step (Levenberg–Marquardt) of P hand-eyes: right twists (P, 6).
+
+    Args:
+        poses: (P, V, 4, 4) of the mount.
+        X: (P, 4, 4) hand-eyes.
+        centroids: (V, 3) of the scans, scanner frame.
+        share: (P, V) weights of the views, of sum 1.
+        damping: (P,) as a share of the diagonal.
+    """
     R = (poses @ X[:, None])[..., :3, :3]
     J = np.concatenate([-R @ frames.skew(centroids)[None], R], axis=3)
     J = J - np.einsum("pv,pvij->pij", share, J)[:, None]

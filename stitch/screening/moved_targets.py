@@ -95,7 +95,13 @@ def _partners(places: Array, k: int) -> Indices:
 
 
 def _steps_of_means(off: Array) -> Array:
-    """(V,) standard errors by which distances (V, P), in sigmas, step before each view, rms; 0 where few are seen."""
+    """Return by how many standard errors distances step before each view (V,), rms over them; 0 where few are seen.
+
+    A step is the difference of the means before and from that view on.
+
+    Args:
+        off: (V, P) distances less their medians, in sigmas; NaN where one is not seen. Outliers are clipped.
+    """
     seen = np.isfinite(off)
     clipped = np.where(seen, np.clip(off, -_CLIPPED, _CLIPPED), 0.0)
     before = np.cumsum(seen.astype(float), axis=0) - seen.astype(float)

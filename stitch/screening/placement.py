@@ -144,7 +144,7 @@ def _evaluate_placements(scan: Scan, poses: Array, surface: ReferenceSurface, pr
 
 
 def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float) -> list[Placement]:
-    """Close in from every start (S, 4, 4); return the best few placements, best first.
+    """Return the best few placements of a scan on a surface, best first, after closing in from every start (S, 4, 4).
 
     Args:
         size: of the part, length_unit: the search reaches a third of it.
@@ -158,7 +158,12 @@ def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float
 
 
 def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array, probes: int) -> Array:
-    """(S, 4, 4) after one Gauss–Newton step per gate, all starts side by side."""
+    """Return poses (S, 4, 4) of a scan after one Gauss–Newton step of point-to-plane ICP per gate from every start.
+
+    Args:
+        gates: largest distances between partners, length_unit, one after the other.
+        probes: points of the scan that are asked.
+    """
     index = sample_points(scan, probes)
     points, normals = scan.points[index], scan.normals[index]
     poses = np.array(starts)

@@ -320,7 +320,13 @@ def _confidence_limit(tested: AlternativeTest, degrees: int) -> float:
 
 
 def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Array:
-    """(k,) the shortest displacement of which the evidence (k, k) is within a limit of that of the estimate (k,)."""
+    """Return the shortest displacement (k,) that the evidence does not tell from the estimate.
+
+    Args:
+        normal: (k, k) N, the evidence: dᵀNd is how much worse a displacement off by d explains it.
+        estimate: (k,) the displacement that explains it best.
+        limit: largest dᵀNd.
+    """
     held, axes = np.linalg.eigh(normal)
     held = np.maximum(held, 0.0)
     seen = axes.T @ estimate

@@ -227,7 +227,13 @@ def field_map(
 def _coarse_fine_likelihood(
     sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int
 ) -> SmoothErrorLikelihood:
-    """Return what the overlaps show of errors that all views share: coarse over the field, finer, over incidence."""
+    """Return the likelihood of errors that all views share, by cause: coarse and finer over the field, incidence.
+
+    Args:
+        sums: of `sum_smooth_errors`, with errors of every view.
+        noise: rms of the sensor, length_unit.
+        nuisance: last columns of the sums, of effects that may have any size.
+    """
     together = sums.merge_sides(per_view=COARSE)
     column = np.arange(together.residual.shape[1])
     # The one over incidence stands after the coarse ones; it is to come last.

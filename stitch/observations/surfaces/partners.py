@@ -71,7 +71,14 @@ def more_points(scans: Sequence[Scan], samples: Sequence[Indices], turns: Indice
 
 
 def _best_of(shares: Array, meet: Mask) -> Mask:
-    """(V, V) which of the pairs that meet are kept, by what both views show of each other (V, V)."""
+    """Return which pairs (V, V) are matched, of those that meet: without which the views would hang together less.
+
+    And of each view the pairs that show most of each other, and some spread over the others.
+
+    Args:
+        shares: (V, V) what both views of a pair show of each other.
+        meet: (V, V) pairs that overlap.
+    """
     kept = meet & (_leverage(np.where(meet, shares, 0.0)) > _IRREPLACEABLE)
     for v, of_view in enumerate(meet):
         partners = np.flatnonzero(of_view)
@@ -83,8 +90,10 @@ def _best_of(shares: Array, meet: Mask) -> Mask:
 
 
 def _leverage(weights: Array) -> Array:
-    """(V, V) share that each edge of a graph has in what holds its two ends together: its effective resistance
-    (Spielman & Srivastava 2011) times its weight (V, V); 1 of a bridge."""
+    """Return the share (V, V) that each edge of a graph has in what holds its two ends together; 1 of a bridge.
+
+    It is the edge's effective resistance times its weight (V, V) (Spielman & Srivastava 2011).
+    """
     inverse = np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights, hermitian=True)
     diagonal = np.diag(inverse)
     return np.asarray(weights * (diagonal[:, None] + diagonal - 2 * inverse))

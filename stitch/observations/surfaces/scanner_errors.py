@@ -225,7 +225,7 @@ class SmoothErrorLikelihood:
 
     @property
     def map_shares(self) -> Array:
-        """(C,) likeliest rms of the errors over the noise, with a prior of usual sizes."""
+        """Return by cause the likeliest rms of the errors over the noise (C,), under a prior of usual sizes (MAP)."""
 
         def deviance(log_shares: Array) -> tuple[float, Array]:
             prior = (log_shares - np.log(USUAL_SHARE)) / SHARE_SPREAD

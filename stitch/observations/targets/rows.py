@@ -66,7 +66,12 @@ class Landmarks:
         return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
 
     def updated(self, by: Array) -> "Landmarks":
-        """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing."""
+        """Return the landmarks after a step of all their unknowns, in this order.
+
+        Args:
+            by: (U,) shifts of the targets; left rotation vector of the probe, if it is held; left twist of the drawing,
+                if there is one.
+        """
         at = self.positions.size
         positions = self.positions + by[:at].reshape(-1, 3)
         orientation, T = self.orientation, self.T_reference_part
