@@ -89,7 +89,7 @@ def dependences(
     best: dict[str, int] = {}
     for k in sorted(clearest, key=lambda k: (p_values[k], k)):
         if laws[k].driver.name not in twins:
-            best.setdefault(laws[k].driver.name, k)
+            best.setdefault(laws[k].driver.covariate, k)
     first, *others = best.values()
     beside = dict(
         zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
@@ -196,7 +196,7 @@ def _dependence(
     # What no motion of a view makes is left as well.
     whole = float(np.sum(linear.white_residual**2)) + linear.mixed.noise_only[1] / linear.null.variances[NOISE]
     return Dependence(
-        covariate=law.driver.name,
+        covariate=law.driver.covariate,
         unit=law.driver.unit,
         place=law.place.name,
         shape=law.shape,

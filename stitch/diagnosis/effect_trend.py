@@ -239,7 +239,7 @@ def trend_of_law(linear: LinearModel, ranked: Ranked) -> EffectTrend | None:
         return None
     scattering = linear.restricted({JOINT_SCATTER})
     beside = conditioned_on_effects(scattering, [ranked], scattering.null.variances)
-    axis = (*_axis_words(law.driver.name), law.driver.values)
+    axis = (*_axis_words(law.driver.covariate), law.driver.values)
     return _trend_of_joint(linear, beside, law.place.joint, law.shapes @ scored.values, axis)
 
 
@@ -247,7 +247,7 @@ def _axis_words(covariate: str) -> tuple[str, str]:
     """Return what a covariate is called along an axis, and its unit where it stands beside."""
     if covariate == "time_s":
         return "time", "s"
-    angle = re.match(r"j(\d+)_deg(?=$|,)", covariate)
+    angle = re.fullmatch(r"j(\d+)_deg", covariate)
     return (f"angle of joint {angle[1]}", "°") if angle else (covariate_text(covariate), "")
 
 

@@ -203,7 +203,7 @@ def law_in_words(law: Law) -> str:
 
     A number of periods a turn is told only where the driven range holds a whole one.
     """
-    joint = re.match(r"j(\d+)_deg(?=$|,)", law.driver.name)
+    joint = re.fullmatch(r"j(\d+)_deg", law.driver.covariate)
     if joint is None:
         return law.words
     angle = "its angle" if law.place.name == f"joint {joint[1]}" else f"the angle of joint {joint[1]}"
@@ -217,7 +217,7 @@ def _laws_found(d: Diagnosis) -> Iterator[str]:
     """Say which laws of the dictionary do, with their sizes, and what to do."""
     if not d.laws:
         return
-    told = [f"{law_in_words(law_of(r))} by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
+    told = [f"{law_in_words(law_of(r))}, by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
     among = "A law does" if len(told) == 1 else "One of these laws does, and these views cannot tell which"
     yield f"{among}: {_listed(told, 'or')} (p = {d.laws[0].adjusted:.1g})."
     yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."

@@ -103,6 +103,11 @@ class Driver:
     joint: int | None = None  # the one that alone may follow it, counted from 1
     kinds: tuple[str, ...] = ("part", "mount", "robot", "links")  # of places that may
 
+    @property
+    def covariate(self) -> str:
+        """What is followed, in whatever shape: short waves of j5_deg are j5_deg."""
+        return self.name.partition(",")[0]
+
 
 @dataclass(frozen=True, eq=False)
 class Place:

@@ -40,10 +40,9 @@ def covariate_unit(name: str) -> str:
 
 def covariate_text(name: str) -> str:
     """Return a covariate with its unit in brackets: j2_deg → j2 (°)."""
-    name, comma, shape = name.partition(",")
     ending = next((ending for ending in _ENDINGS if name.endswith(ending)), "")
     words = name.removesuffix(ending).replace("_", " ")
-    return f"{words} ({_ENDINGS[ending]}){comma}{shape}" if ending else f"{words}{comma}{shape}"
+    return f"{words} ({_ENDINGS[ending]})" if ending else words
 
 
 def duration_text(seconds: float) -> str:

@@ -140,8 +140,8 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
         remedy = "" if by_view else "have the scanner calibrated"
     elif diagnosis.verdict == "unknown_effect" and diagnosis.laws:
         law = law_of(diagnosis.laws[0])
-        remedy = f"look for what changes with {plain_covariate(law.driver.name)} at {law.place.name}"
-        if law.driver.name.startswith(f"j{law.place.joint}_deg"):
+        remedy = f"look for what changes with {plain_covariate(law.driver.covariate)} at {law.place.name}"
+        if law.driver.covariate == f"j{law.place.joint}_deg":
             remedy = f"have joint {law.place.joint} checked: gear, bearing, and what hangs on it"
     elif diagnosis.verdict == "unknown_effect" and diagnosis.curves:
         curve = diagnosis.curves[0]

@@ -163,7 +163,7 @@ function coursePlot(course, names, um, known = true) {
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
   const [measured, sigma, predicted, about] = [course.measured, course.sigma, course.predicted, course.predicted_sigma].map(scaled);
-  const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))(, in short waves)?$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
+  const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
   const named_ = course.views.map(v => names ? names[v] : String(v)), middle = (Math.max(...predicted) + Math.min(...predicted)) / 2;
   const side = predicted.map(p => p > middle), first = inOrder ? side.findIndex(s => s !== side[0]) : -1;
   const jumps = first > 0 && side.slice(first).every(s => s !== side[0]);
