@@ -12,7 +12,7 @@ from viz.course_recording import WHERE, X_RANGE, Y_RANGE
 from viz.model_timeline import ModelScene, shown_steps
 from viz.part_surface import Camera
 
-# A colour bar as a native picture of a recording.
+os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 _LENGTH, _HEIGHT = 256, 14
 # All of it with its words, which are as large in any window.
@@ -30,10 +30,6 @@ def log_colour_bar(recording: rr.RecordingStream, path: str, ticks: list[str], g
     unseen = rr.Points2D(below, labels=[f"grey: {grey}"], radii=0.4, colors=[UNSEEN], show_labels=True)
     recording.log(f"{path}/grey", unseen, static=True)
 
-
-# An eye of the viewer from which everything is in the picture, and in its middle.
-
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 # Tangent of half the viewer's field, 55 degrees high, with a margin.
 _HIGH = 0.47
@@ -54,9 +50,6 @@ def eye_for(points: Array, axes: Array, up: Array, aspect: float) -> rrb.EyeCont
         seen = np.array([x, y]) / (away - z)
         middle = middle + 0.5 * away * (seen.min(axis=1) + seen.max(axis=1)) @ axes[:2]
     return rrb.EyeControls3D(position=middle + away * axes[2], look_target=middle, eye_up=up)
-
-
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
 # Width over height, in an ordinary window, of a picture of the part, of all scans and of the cell.
@@ -80,10 +73,10 @@ def model_blueprint(scene: ModelScene, camera: Camera, raw: Array, moments: int)
         _part("part/before", scene.title(before), scene, camera),
         _part("part/after", scene.title(after) + unit, scene, camera),
         rrb.Vertical(
-            rrb.TextDocumentView(origin="verdict", name="What was found"),
             _missing(),
+            rrb.TextDocumentView(origin="verdict", name="What the run found"),
             _bar("colours/field", "Views disagree by (µm)"),
-            row_shares=[20, 5, 5],
+            row_shares=[12, 13, 5],
         ),
         column_shares=[3, 3, 2],
     )
@@ -135,10 +128,10 @@ def target_blueprint(cell: Array) -> rrb.Blueprint:
             origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
         ),
         rrb.Vertical(
-            rrb.TextDocumentView(origin="verdict", name="What was found"),
             _missing(),
+            rrb.TextDocumentView(origin="verdict", name="What the run found"),
             rrb.TextDocumentView(origin="now", name="Sticks"),
-            row_shares=[8, 3, 2],
+            row_shares=[5, 6, 2],
         ),
         column_shares=[3, 2],
     )
