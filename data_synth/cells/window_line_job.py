@@ -24,15 +24,14 @@ path = "{path}.csv"  # of the gripper, programmed for a {part} that stands as [n
 
 [nominal]
 {nominal}
-"""
+{errors}"""
 _SEAM = """# Does the window sit in the body as it should?
 format = "stitch-seam/1"
 session = "seam"
 hand_eye = "hand-eye.json"
 fit = "found-body/fit.json"  # as `stitch fit body.toml -o found-body` wrote it
 stations = "stations.csv"  # in the body's frame
-pose_sigma = {sigma:.3f}  # what one scan may stand off another: the robot's scatter in both
-"""
+{errors}"""
 _BEFORE = """# How will the window sit in the body, and over its flange? Asked before it is gripped.
 format = "stitch-seam/1"
 session = "body"
@@ -43,9 +42,14 @@ stations = "stations.csv"
 session = "window"
 fit = "found-window/fit.json"
 thickness = {thickness}
+{errors}"""
+# As the data sheets of robot and rail say.
+_ERRORS = """
 [errors]
-rotation = {turn}
-translation = {shift:.4f}
+rotation = {turn}  # of the flange, rad, new in every view
+translation = {shift}  # of the flange, new in every view
+carriage = {rail}  # of the rail's carriage, new at every stop
+carriage_column = "rail_mm"
 """
 
 
@@ -61,17 +65,22 @@ def write_line(folder: Path, line: WindowLine) -> None:
         write_path(folder / f"{name}.csv", path)
         (folder / f"{name}.src").write_text(_program(name, path), encoding="utf-8")
     write_stations(folder / "stations.csv", *line.stations())
+    errors = stated_errors(line)
     for part, path, T in (
         ("window", "grip", line.T_cell_window_nominal),
         ("body", "place", line.T_cell_body_nominal),
     ):
-        text = _FIT.format(part=part, path=path, nominal=pose_table(T))
+        text = _FIT.format(part=part, path=path, nominal=pose_table(T), errors=errors)
         (folder / f"{part}.toml").write_text(text, encoding="utf-8")
-    (folder / "seam.toml").write_text(_SEAM.format(sigma=np.sqrt(2) * line.errors.shift), encoding="utf-8")
+    (folder / "seam.toml").write_text(_SEAM.format(errors=errors), encoding="utf-8")
     if line.door.rebate:
-        shift = np.hypot(line.errors.shift, line.errors.rail)
-        before = _BEFORE.format(thickness=line.pane.glass, turn=line.errors.turn, shift=shift)
+        before = _BEFORE.format(thickness=line.pane.glass, errors=errors)
         (folder / "before.toml").write_text(before, encoding="utf-8")
+
+
+def stated_errors(line: WindowLine) -> str:
+    """The table of a job that says how places may err."""
+    return _ERRORS.format(turn=line.errors.turn, shift=line.errors.shift, rail=line.errors.rail)
 
 
 def _program(name: str, T_cell_tool: Array) -> str:

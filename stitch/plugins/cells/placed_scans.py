@@ -6,7 +6,7 @@ modes as the sum of its squared answers, whatever it fits.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -29,7 +29,7 @@ from stitch.session.session import SessionData
 _MIN_SCAN_POINTS = 50
 # Columns of views.csv: the flange's velocity in the base (length_unit/s) while a line scanner sweeps without turning.
 SWEEP = ("sweep_x", "sweep_y", "sweep_z")
-SOURCES = ("hand_eye", "robot", "scanner")
+SOURCES = ("hand_eye", "robot", "carriage", "scanner")
 # Smooth errors along the ray: products of Legendre polynomials over the field up to this degree, without a constant.
 _FIELD_DEGREE = 2
 
@@ -45,6 +45,7 @@ class PlacedScans:
     length_unit: str = "mm"  # as a session states it; a table of scans does not
     carried: tuple[Array, ...] = ()  # (N, 3) each: how far the flange had moved when a sweep saw each point, base frame
     errors: "PlacingErrors | None" = None  # None: nobody says how the places may err
+    columns: tuple[Mapping[str, float], ...] = ()  # of each scan in its session, those that are no pose
 
     @property
     def T_base_scanner(self) -> Array:
@@ -109,13 +110,19 @@ def with_part_yet_to_place(placed: PlacedScans, part: PlacedScans, T: Array) -> 
     ]
     seen = [frames.transform(S, cloud.mean(axis=0)) for S, cloud in zip(part.T_base_scanner, part.clouds, strict=True)]
     held = T @ frames.make(np.eye(3), np.mean(seen, axis=0))
+    errors = placed.errors
+    if errors is not None:
+        stop = errors.stop
+        if stop is not None and part.errors is not None and part.errors.stop is not None:
+            stop = np.concatenate([stop, stop.max() + 1 + part.errors.stop])
+        errors = replace(errors, T_base_flange=poses, gripped=(first, held), stop=stop)
     return replace(
         placed,
         names=(*placed.names, *(f"part-{name}" for name in part.names)),
         clouds=placed.clouds + part.clouds,
         T_base_flange=poses,
         carried=carried[0] + carried[1] if placed.carried or part.carried else (),
-        errors=placed.errors and replace(placed.errors, T_base_flange=poses, gripped=(first, held)),
+        errors=errors,
     )
 
 
@@ -169,7 +176,8 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
         back = (poses @ T_flange_scanner)[:, :3, :3]
         points = [cloud + moved @ R for cloud, moved, R in zip(points, carried, back, strict=True)]
     names = tuple(session.names)
-    return PlacedScans(names, tuple(points), poses, T_flange_scanner, session.length_unit, carried, errors)
+    columns = tuple(view.covariates for view in session.views)
+    return PlacedScans(names, tuple(points), poses, T_flange_scanner, session.length_unit, carried, errors, columns)
 
 
 def _sweeps(session: SessionData) -> tuple[Array, ...]:
@@ -236,8 +244,10 @@ class PlacingErrors:
     hand_eye: Array  # (6, 6) covariance of ξ in T_flange_scanner · exp(ξ), rotation first
     rotation: float = 0.0  # of the flange about each axis, new in every view
     translation: float = 0.0  # of the flange along each axis, new in every view
+    carriage: float = 0.0  # of the robot's carriage along each axis of the base, the same in all views of one stop
     scanner: float = 0.0  # rms over the field of the scanner's smooth error along the ray, the same in all views
     gripped: tuple[int, Array] | None = None  # scans from that one on show a part yet to be moved, held there (4, 4)
+    stop: Indices | None = None  # (V,) of the carriage, counted from 0; None: it has no errors
 
     def modes(self, scan: JoinedScans, source: str) -> Iterator[tuple[Indices, Array]]:
         """Yield the modes of one of SOURCES: which points move (M,), and by how much in the base frame (M, 3)."""
@@ -259,8 +269,14 @@ class PlacingErrors:
             if self.gripped is not None:
                 index = np.flatnonzero(scan.view >= self.gripped[0])
                 # The robot goes to it, and with it to its place: two moves.
-                for xi in np.sqrt(2) * np.diag(np.repeat([self.rotation, self.translation], 3)):
+                shift = np.hypot(self.translation, self.carriage)
+                for xi in np.sqrt(2) * np.diag(np.repeat([self.rotation, shift], 3)):
                     yield index, _moved(self.gripped[1], scan.points[index], xi)
+        elif source == "carriage":
+            stops = np.zeros(0, int) if self.stop is None else self.stop[scan.view]
+            for stop in np.unique(stops):
+                index = np.flatnonzero(stops == stop)
+                yield from ((index, np.tile(shift, (len(index), 1))) for shift in self.carriage * np.eye(3))
         elif self.scanner:
             yield from ((everything, self.scanner * mode) for mode in self._field_modes(scan))
 
@@ -294,13 +310,30 @@ def stated_errors(document: JobTable, placed: PlacedScans) -> PlacingErrors | No
     Raises:
         InputError: an unknown key, or something that is no number.
     """
-    table = document.table("errors", ("rotation", "translation", "scanner"))
+    table = document.table("errors", ("rotation", "translation", "carriage", "carriage_column", "scanner"))
     if not table.entries:
         return placed.errors
-    known = placed.errors or PlacingErrors(placed.T_base_flange, placed.T_flange_scanner, np.zeros((6, 6)))
+    known = placed.errors or exact_placing(placed)
+    carriage = abs(table.number("carriage", 0.0))
     return replace(
         known,
         rotation=abs(table.number("rotation", known.rotation)),
         translation=abs(table.number("translation", known.translation)),
+        carriage=carriage,
         scanner=abs(table.number("scanner", known.scanner)),
+        stop=_stops(table, placed) if carriage else None,
     )
+
+
+def exact_placing(placed: PlacedScans) -> PlacingErrors:
+    """Return errors of which none is known yet."""
+    return PlacingErrors(placed.T_base_flange, placed.T_flange_scanner, np.zeros((6, 6)))
+
+
+def _stops(table: JobTable, placed: PlacedScans) -> Indices:
+    """Return the carriage's stop (V,) of each scan: it stands where its column of views.csv says the same."""
+    if not placed.columns:
+        raise table.refusal("carriage", "leave it out, for a table of scans does not say where a carriage stood")
+    shared = [name for name in placed.columns[0] if all(name in row for row in placed.columns)]
+    column = table.choice("carriage_column", shared)
+    return np.unique([row[column] for row in placed.columns], return_inverse=True)[1].ravel()

@@ -204,7 +204,6 @@ def measure_seam(
     T_base_part: Array,
     stations: Sequence[Station],
     limits: Limits,
-    pose_sigma: float = 0.0,
     errors: PlacingErrors | None = None,
     pane: Pane | None = None,
 ) -> list[Seam]:
@@ -215,11 +214,9 @@ def measure_seam(
 
     Args:
         T_base_part: (4, 4) of the part in whose frame the stations are given.
-        pose_sigma: what one scan may stand off another, mm; where it is stated, it takes the place of the robot's
-            scatter in `errors`.
         errors: how the scans' places may err. What moves both edges alike does not count.
     """
-    return [_measure_station(scan, T_base_part, station, limits, pose_sigma, errors, pane) for station in stations]
+    return [_measure_station(scan, T_base_part, station, limits, errors, pane) for station in stations]
 
 
 def _measure_station(
@@ -227,7 +224,6 @@ def _measure_station(
     T_base_part: Array,
     station: Station,
     limits: Limits,
-    pose_sigma: float,
     errors: PlacingErrors | None,
     pane: Pane | None,
 ) -> Seam:
@@ -238,8 +234,7 @@ def _measure_station(
     normals = frames.rotate(T_station_base, scan.normals[near])
     modes: list[tuple[Indices, Array]] = []
     if errors is not None:
-        sources = [source for source in SOURCES if not (pose_sigma and source == "robot")]
-        modes = [mode for source in sources for mode in errors.modes(scan.take(near), source)]
+        modes = [mode for source in SOURCES for mode in errors.modes(scan.take(near), source)]
     moves = np.zeros((len(modes), *points.shape))
     for k, (index, moved) in enumerate(modes):
         moves[k, index] = frames.rotate(T_station_base, moved)
@@ -256,7 +251,7 @@ def _measure_station(
     gap = float(outer[0] - inner[0])
     flush = float(inner[1] - outer[1])
     apart = ((outer_moved - inner_moved) ** 2).sum(axis=1)
-    sigma_gap, sigma_flush = np.sqrt(np.diag(inner_spread) + np.diag(outer_spread) + pose_sigma**2 + apart)
+    sigma_gap, sigma_flush = np.sqrt(np.diag(inner_spread) + np.diag(outer_spread) + apart)
     verdict = _verdict(
         (abs(flush - limits.flush) - limits.flush_tolerance, sigma_flush),
         (abs(gap - limits.gap) - limits.gap_tolerance, sigma_gap),
@@ -271,7 +266,7 @@ def _measure_station(
         inner=(float(inner[0]), float(inner[1])),
         outer=(float(outer[0]), float(outer[1])),
         bond=bond,
-        sigma_bond=float(np.sqrt(bond_variance + pose_sigma**2 + bond_moved @ bond_moved)),
+        sigma_bond=float(np.sqrt(bond_variance + bond_moved @ bond_moved)),
     )
 
 

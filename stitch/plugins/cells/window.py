@@ -31,9 +31,11 @@ from stitch.plugins.cells.job_files import (
     write_poses,
 )
 from stitch.plugins.cells.placed_scans import (
+    SOURCES,
     JoinedScans,
     PlacedScans,
     assemble_scans,
+    exact_placing,
     read_placed_session,
     read_scan_table,
     stated_errors,
@@ -62,7 +64,7 @@ _FIT_KEYS = {"format", *_SCANS, "cad", "length_unit", "instances", "tolerance", 
 _FIT_KEYS |= {"coverage"}
 _SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma", "pane"}
 NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
-_SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
+_SOURCE_WORDS = {"scan": "the scan's noise"} | {source: f"the {source.replace('_', '-')}" for source in SOURCES}
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,6 @@ class SeamJob:
     T_base_part: Array  # (4, 4)
     stations: tuple[Station, ...]
     limits: Limits
-    pose_sigma: float
     file: Path | None = None  # that was read
     pane: Pane | None = None  # where it is yet to be placed
 
@@ -155,6 +156,10 @@ def read_seam_job(file: Path | str) -> SeamJob:
     T_base_part = document.pose("part") if "part" in document else _fitted_pose(document.path("fit"))
     limits = document.table("limits", Limits.__dataclass_fields__)
     placed = _read_scans(document)
+    if pose_sigma := abs(document.number("pose_sigma", 0.0)):
+        # Two scans stand that far off each other where each stands a √2th of it off its place.
+        errors = placed.errors or exact_placing(placed)
+        placed = replace(placed, errors=replace(errors, rotation=0.0, translation=pose_sigma / np.sqrt(2)))
     pane = None
     if "pane" in document:
         entries = document.table("pane", ("session", "fit", "thickness"), required=True)
@@ -162,14 +167,13 @@ def read_seam_job(file: Path | str) -> SeamJob:
         # Both CADs lie in one frame, as the window sits in the body.
         T = T_base_part @ frames.inverse(_fitted_pose(entries.path("fit")))
         loose = read_placed_session(entries.path("session"), document.path("hand_eye"))
-        placed = with_part_yet_to_place(placed, loose, T)
+        placed = with_part_yet_to_place(placed, replace(loose, errors=stated_errors(document, loose)), T)
     return SeamJob(
         placed=placed,
         scan=assemble_scans(placed),
         T_base_part=T_base_part,
         stations=_read_stations(document.path("stations")),
         limits=Limits(**{key: limits.number(key, positive="tolerance" in key) for key in limits.entries}),
-        pose_sigma=abs(document.number("pose_sigma", 0.0)),
         file=file,
         pane=pane,
     )
@@ -350,8 +354,7 @@ def solve_seam(job: SeamJob) -> list[Seam]:
     Raises:
         NoResultError: no station could be measured.
     """
-    errors = job.placed.errors
-    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma, errors, job.pane)
+    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.placed.errors, job.pane)
     if all(seam.verdict == "not measured" for seam in seams):
         raise NoResultError(f"no station could be measured; the first: {seams[0].reason}")
     return seams

@@ -262,6 +262,17 @@ def test_modes_move_points_as_frames_do(pane):
     assert np.abs(moved - truly[own]).max() < 1e-3 * np.abs(moved).max()
 
 
+def test_scans_of_one_stop_are_displaced_alike(pane):
+    scans, poses = scans_of(pane)
+    scan = join_scans(scans, poses @ X)
+    errors = errors_of(poses, carriage=0.3, stop=np.arange(len(poses)) // 2)
+    modes = list(errors.modes(scan, "carriage"))
+    assert len(modes) == 3 * (errors.stop.max() + 1)
+    for k, (index, moved) in enumerate(modes):
+        assert (moved == 0.3 * np.eye(3)[k % 3]).all()
+        assert set(errors.stop[scan.view[index]]) == {k // 3}
+
+
 def sweeps(folder, columns=("sweep_x", "sweep_y", "sweep_z"), time=True):
     """Two sweeps over a plane; returns the session, its hand-eye, and where each sweep's points lie in the base."""
     rng = np.random.default_rng(3)
@@ -358,10 +369,15 @@ def test_gap_and_flush_answer_as_a_measurement_of_the_misplaced_scans(pane):
         wanted = abs(getattr(moved, name) - getattr(alone, name))
         added = np.sqrt(getattr(known, f"sigma_{name}") ** 2 - getattr(alone, f"sigma_{name}") ** 2)
         assert added == pytest.approx(wanted, rel=0.1, abs=2e-4)
-    # A stated pose_sigma takes the place of the robot's scatter.
-    robot = errors_of(T_base_flange, translation=5.0)
-    (stated,) = measure_seam(scan, np.eye(4), [station], Limits(), 0.1, robot)
-    assert stated.sigma_gap == pytest.approx(np.hypot(alone.sigma_gap, 0.1))
+    # Each flank is seen by one scan, both surfaces by both: what the scans are apart is in the gap, less in the flush.
+    robot = errors_of(T_base_flange, translation=0.1 / np.sqrt(2))
+    (apart,) = measure_seam(scan, np.eye(4), [station], Limits(), errors=robot)
+    assert apart.sigma_gap == pytest.approx(np.hypot(alone.sigma_gap, 0.1), rel=0.3)
+    assert apart.sigma_flush < 0.05
+    # What the scans of one stop share is in neither.
+    carriage = errors_of(T_base_flange, carriage=0.1, stop=np.zeros(len(poses), int))
+    (alike,) = measure_seam(scan, np.eye(4), [station], Limits(), errors=carriage)
+    assert max(alike.sigma_gap - alone.sigma_gap, alike.sigma_flush - alone.sigma_flush) < 0.01
 
 
 def test_hand_eye_file_brings_its_errors(tmp_path):
@@ -382,5 +398,13 @@ def test_job_states_what_nobody_measured(tmp_path):
     placed = PlacedScans((), (), np.zeros((0, 4, 4)), X)
     assert stated_errors(JobTable(tmp_path, {}), placed) is None
     assert stated_errors(JobTable(tmp_path, {"errors": {"scanner": 0.02}}), placed).scanner == 0.02
+    on_rail = replace(placed, columns=tuple({"rail_mm": at, "odd": 1.0} for at in (500.0, 0.0, 500.0)))
+    table = {"carriage": 0.02, "carriage_column": "rail_mm"}
+    errors = stated_errors(JobTable(tmp_path, {"errors": table}), on_rail)
+    assert errors.carriage == 0.02 and errors.stop.tolist() == [1, 0, 1]
+    with pytest.raises(InputError, match=r"carriage_column is 'rail'; to fix: write one of rail_mm, odd"):
+        stated_errors(JobTable(tmp_path, {"errors": table | {"carriage_column": "rail"}}), on_rail)
+    with pytest.raises(InputError, match=r"errors\.carriage is 0.02; to fix: leave it out"):
+        stated_errors(JobTable(tmp_path, {"errors": table}), placed)
     with pytest.raises(InputError, match=r"errors\.scaner.*to fix: write 'scanner'"):
         stated_errors(JobTable(tmp_path, {"errors": {"scaner": 0.02}}), placed)
