@@ -59,7 +59,12 @@ class InputError(StitchError):
 
 
 class ScaleError(InputError):
-    """Lengths that only make sense in another unit; `views` of them alone, or none: all."""
+    """Lengths that only make sense in another unit.
+
+    Args:
+        message: what is wrong, where, and how to fix it.
+        views: names of the views whose lengths are meant; () means all views.
+    """
 
     def __init__(self, message: str, views: tuple[str, ...] = ()) -> None:
         super().__init__(message)
@@ -86,7 +91,7 @@ class NoResultError(StitchError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'range_scale'?" where one of the known names is close to what was written, else ""."""
+    """Return "; did you mean 'range_scale'?" for the known name that is closest to a misspelt one; "" if none is."""
     from difflib import get_close_matches
 
     by_small_letters = {other.lower(): other for other in known}

@@ -11,14 +11,25 @@ from stitch.session.session import SessionData
 
 
 class Recorder(Protocol):
-    """Receives every stage and iteration, and does nothing. All poses are T_reference_scanner, (V, 4, 4)."""
+    """What a viewer implements to follow a run; by default each call does nothing.
+
+    All poses are T_reference_scanner (V, 4, 4), lengths in length_unit.
+    """
 
     def start(self, session: SessionData) -> None:
         """Called once, before the first stage, with the scans and the robot's path."""
         return
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Called after each iteration of a stage; `gate` is the largest distance paired."""
+        """Called after each iteration of a stage.
+
+        Args:
+            stage: coarse | correct | register | fuse.
+            index: of the iteration.
+            poses: (V, 4, 4) T_reference_scanner after it.
+            rms: of the distances between corresponding points, length_unit.
+            gate: largest distance between two corresponding points, length_unit.
+        """
         return
 
     def stage(self, result: StageResult, poses: Array) -> None:
@@ -35,75 +46,78 @@ class SilentRecorder(Recorder):
 
 
 class RecorderMemory:
-    """Keeps what it is told by stages that run beside others, to tell it in their turn."""
+    """A recorder that stores its calls, so that they can be replayed later to another one.
+
+    Stages that run in the background record into one each; the main thread replays them in the order of the stages.
+    """
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.stopped = False
 
     def tell(self, call: str, *arguments: Any) -> None:
-        """Keep one call.
+        """Store one call: the method's name and its arguments.
 
         Raises:
-            CancelledError: nobody wants the stages any more (`stopped`), so that they end here.
+            CancelledError: another thread has set `stopped`, since the result is not needed: the stage ends here.
         """
         if self.stopped:
             raise CancelledError
         self.calls.append((call, arguments))
 
     def start(self, session: SessionData) -> None:
-        """Tell that a run begins."""
+        """Store the call `start`."""
         self.tell("start", session)
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Tell one iteration."""
+        """Store the call `iteration`."""
         self.tell("iteration", stage, index, poses, rms, gate)
 
     def stage(self, result: StageResult, poses: Array) -> None:
-        """Tell the end of a stage."""
+        """Store the call `stage`."""
         self.tell("stage", result, poses)
 
     def finish(self, run: RunData) -> None:
-        """Tell the result."""
+        """Store the call `finish`."""
         self.tell("finish", run)
 
     def replay(self, recorder: Recorder) -> None:
-        """Pass on all that was kept."""
+        """Make all stored calls on another recorder, in their order."""
         for call, arguments in self.calls:
             getattr(recorder, call)(*arguments)
 
 
 class RunMemory(RecorderMemory):
-    """Keeps what is told of runs that are tried one after the other, to tell it of the one that counts."""
+    """A recorder that stores the calls of several runs, tried one after the other, to replay those of the chosen one."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []
+        self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []  # of each run its model and its calls
 
     def start(self, session: SessionData) -> None:
-        """Begin to keep another run."""
+        """Begin to store the calls of another run."""
         self.calls = []
         super().start(session)
 
     def finish(self, run: RunData) -> None:
-        """Take what was kept as that of a run."""
+        """File the calls stored since `start` under the model of their run."""
         self._finished.append((run.model, self.calls))
 
     def replay_run(self, recorder: Recorder, run: RunData) -> None:
-        """Pass on all that was kept of a run, and the run as it is now."""
+        """Make all calls of the run with the same model object on another recorder, then `finish` with `run`."""
         self.calls = next((calls for model, calls in self._finished if model is run.model), [])
         self.replay(recorder)
         recorder.finish(run)
 
 
 class RecorderGroup(RecorderMemory):
-    """Several recorders at once."""
+    """A recorder that passes every call on to several recorders at once, and stores none."""
 
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         super().__init__()
         self.recorders = recorders
 
     def tell(self, call: str, *arguments: Any) -> None:
-        """Pass on one call, which nobody asks for again."""
+        """Make one call on every recorder."""
         for recorder in self.recorders:
             getattr(recorder, call)(*arguments)

@@ -56,7 +56,7 @@ class StageResult(Value):
 
     @property
     def remark(self) -> str:
-        """The method in words, and the note."""
+        """The method in words and the note, with a semicolon between them; either may be empty."""
         return "; ".join(text for text in (METHOD_TITLES.get(self.method, self.method), self.note) if text)
 
 
@@ -77,19 +77,20 @@ class FusedCloud(Value):
 
 @dataclass(frozen=True)
 class Unsupported:
-    """How many scanned points are not in the stitched cloud, of how many."""
+    """Numbers of scanned points, and of those that are not in the stitched cloud."""
 
-    points: int = 0
+    points: int = 0  # scanned points, in the cloud or not
     alone: int = 0  # on no surface of their own view or of others
     looked_through: int = 0  # other views look past them
 
     def __add__(self, other: "Unsupported") -> "Unsupported":
+        """Return the numbers of two sets of points together."""
         alone, through = self.alone + other.alone, self.looked_through + other.looked_through
         return Unsupported(self.points + other.points, alone, through)
 
     @property
     def share(self) -> float:
-        """Of all points."""
+        """The share of all scanned points that are not in the stitched cloud, 0 to 1."""
         return (self.alone + self.looked_through) / max(self.points, 1)
 
 
@@ -167,7 +168,10 @@ class Fit(Value):
 
 @dataclass(frozen=True)
 class HandEyeTransfer:
-    """How far a given hand-eye and the one of the views themselves put the middle of the part apart."""
+    """How a given hand-eye compares with the one fitted to these views, at the middle of the part.
+
+    Its expanded uncertainties U cover 95 %.
+    """
 
     turn: float  # rad, between the two
     distance: float  # length_unit
@@ -183,11 +187,11 @@ class HandEyeTransfer:
 
     @property
     def decides(self) -> bool:
-        """True if these views would show a hand-eye that is off by five times its U."""
+        """True if these views would show a given hand-eye that is off by `FOUND_FROM` times its own U."""
         return FOUND_FROM * self.U_given >= self.U
 
     def sentence(self, unit: str) -> str:
-        """Return how the two compare, for people."""
+        """Return a sentence for people on how the two hand-eyes compare, lengths from length_unit `unit`."""
         away = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad away at the part"
         if self.holds:
             return f"The given hand-eye agrees with these views: the one that they show lies {away}, within U of both."
@@ -198,9 +202,16 @@ class HandEyeTransfer:
 
 
 def passed_on(place: str, kind: type[Passed], doc: str) -> Passed:
-    """Return a property that hands out what stands at a place below, as `fit.poses`, and is of this kind."""
+    """Return a read-only property for an attribute of an attribute, as `fit.poses`.
+
+    Args:
+        place: dotted path from the object that has the property.
+        kind: type of the value, for annotations.
+        doc: docstring of the property.
+    """
 
     def value(owner: Any) -> Any:
+        """Return the value at `place`."""
         return attrgetter(place)(owner)
 
     value.__annotations__["return"] = kind
@@ -211,7 +222,7 @@ def passed_on(place: str, kind: type[Passed], doc: str) -> Passed:
 class RunData(Table, document="stitch.output.result_document:result_document", table="views"):
     """One session, its model and its results, as `result.json` and the report show them.
 
-    Of a run that was read from a folder, `fit` is read and matched again when it is first asked for.
+    `source` is the fit itself; of a run read from a folder it is a function that reads it when `fit` is first used.
     """
 
     session: SessionData  # without the views that were left out
@@ -256,7 +267,7 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
 
     @property
     def heldout_or_fit_rms(self) -> float:
-        """On views left out, length_unit; that of the fit where the history does not know it."""
+        """The rms on held-out views by the last step of the ledger, length_unit; `residual_rms` if that is unknown."""
         known = self.ledger[-1].heldout_rms if self.ledger else np.nan
         return known if np.isfinite(known) else self.residual_rms
 
@@ -330,18 +341,21 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
 
 
 def doubt_headline(doubt: str) -> str:
-    """Return a doubt in one clause: up to what to do, or to its first colon or full stop outside brackets."""
+    """Return the first clause of a doubt, a sentence on the session, with a full stop.
+
+    It ends at the first colon, full stop or "; to fix: " outside brackets, else with the text.
+    """
     ends = (end.start() for end in _CLAUSE_END.finditer(doubt))
     outside = (i for i in ends if doubt[:i].count("(") == doubt[:i].count(")"))
     return f"{doubt[: next(outside, len(doubt.rstrip('.')))]}."
 
 
 def effect_cure(effect: str) -> str:
-    """Return what a doubt says of an effect that would hold what is doubted."""
+    """Return the words by which a doubt recommends an effect of the model: "add the effect gear_wave"."""
     return f"add the effect {effect}"
 
 
 def doubt_remedy(doubt: str) -> str:
-    """Return what a doubt says after its headline; empty where that is all."""
+    """Return the text of a doubt after its first clause (`doubt_headline`), capitalised; empty if there is none."""
     more = doubt[len(doubt_headline(doubt)) - 1 :].lstrip(";:. ")
     return more[:1].upper() + more[1:]

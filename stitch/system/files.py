@@ -37,9 +37,12 @@ _held: dict[Path, int] = {}  # locks of this process and how many blocks hold ea
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a scratch file beside `path` that takes its place if the block succeeds, and goes if it fails."""
+    """Yield the path of a scratch file beside `path`: renamed to `path` if the block succeeds, deleted if it fails.
+
+    Errors of the file system at the scratch file name `path`, the file that was asked for.
+    """
     scratch = path.with_name(f".{path.name}.new")
-    # One that a stranger has put there may be a link to elsewhere.
+    # A file that another user has put there may be a link to elsewhere: it is never written through.
     with report_errors_as(path, scratch):
         scratch.unlink(missing_ok=True)
         try:
@@ -52,12 +55,15 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
-    """Yield a scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
+    """Yield a scratch folder: it replaces the folder `path` if the block succeeds, and is deleted if it fails.
 
-    A link stays one: what it points to is rewritten. What in `path` is not `ours` is kept.
+    A link stays a link: the folder that it points to is replaced.
+
+    Args:
+        ours: True for a path, relative to the folder, that this program writes: those go, all others are kept.
 
     Raises:
-        InputError: another process writes there.
+        BusyError: another process writes there.
     """
     asked, path = path, path.resolve()
     with claim_folder(asked) as home:
@@ -65,13 +71,13 @@ def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
             scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
         try:
             yield scratch
-            umask = os.umask(0)  # which is told only in exchange for another
+            umask = os.umask(0)  # the system returns the old value only when a new one is set
             os.umask(umask)
             scratch.chmod(0o777 & ~umask)
             sync_to_disk(scratch)
             _commit(scratch, path, ours)
         except OSError as error:
-            # The scratch folder is gone when somebody reads this.
+            # The scratch folder will be deleted, so that the message names the folder that was asked for.
             place = str(error.filename or path).replace(str(scratch), str(path))
             raise OSError(error.errno, error.strerror or str(error), place) from None
         finally:
@@ -80,16 +86,21 @@ def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
 
 @contextmanager
 def claim_folder(path: Path) -> Iterator[Path]:
-    """Hold a folder as its only writer, in the state of its last writer; yields where its scratch folders go.
+    """Lock a folder for this process while the block runs; yield the folder in which its scratch folders are made.
+
+    Before that, a replacement that an earlier process has begun and not finished is finished or cleared away.
+
+    Args:
+        path: the folder; it need not exist yet.
 
     Raises:
-        InputError: another process writes there.
+        BusyError: another process writes there.
     """
     asked, path = path, path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
     with only_writer(beside / f".{path.name}.lock", asked):
-        # A new folder is made beside the old one, or in it where that must stay.
+        # A new folder is made beside the old one; inside it where that cannot be renamed: a mount, a working folder.
         here = Path.cwd()
         home = path if path in (here, *here.parents) or os.path.ismount(path) else beside
         _recover(home, path)
@@ -101,9 +112,14 @@ def _prefix(path: Path) -> str:
 
 
 def _recover(home: Path, path: Path) -> None:
-    """Finish or clear away what a process that was ended has left."""
+    """Finish the replacement of `path` that a killed process had committed, and delete scratch folders it has left.
+
+    Args:
+        home: the folder that holds scratch folders, `path` itself or the one above.
+    """
     if (path / _COMMIT).is_dir():
         _finish_commit(path)
+    # Killed between the two renamings of `_commit`: the old folder has left its place, the new one is not there yet.
     old = home / f"{_prefix(path)}old"
     if old.is_dir() and not path.exists():
         old.rename(path)
@@ -112,13 +128,14 @@ def _recover(home: Path, path: Path) -> None:
 
 
 def _commit(scratch: Path, path: Path, ours: Ours) -> None:
-    """Put a scratch folder in the place of `path`; whoever is killed meanwhile leaves the old one or the new.
+    """Put a scratch folder in the place of `path`; a process killed meanwhile leaves the old content or the new.
 
-    Files that are not ours stay. A scratch folder inside `path` first says which files go, and is renamed: from then on
-    it counts (`_recover` finishes it). One beside `path` takes over what is not ours, and changes places with it.
+    A scratch folder inside `path` writes down which files are to be deleted, and is renamed to `_COMMIT`. From then on
+    the new content counts: the next process finishes it (`_recover`). One beside `path` takes over, as links, the files
+    that are not ours; then the two folders exchange their names.
 
     Args:
-        ours: whether a file, by its path inside `path`, is one that we write.
+        ours: True for a file, by its path relative to `path`, that this program writes; all others are kept.
     """
     if scratch.parent == path:
         goes = [str(f.relative_to(path)) for f in _list_files(path) if ours(f.relative_to(path))]
@@ -132,6 +149,7 @@ def _commit(scratch: Path, path: Path, ours: Ours) -> None:
             inside = file.relative_to(path)
             if not ours(inside) and not (scratch / inside).exists():
                 _preserve_file(file, scratch / inside)
+        # Without an exchange in one step there are two, and `_recover` mends what ends between them.
         if not exchange_paths(scratch, path):
             old = scratch.with_name(f"{_prefix(path)}old")
             path.rename(old)
@@ -140,7 +158,10 @@ def _commit(scratch: Path, path: Path, ours: Ours) -> None:
 
 
 def _finish_commit(path: Path) -> None:
-    """Delete what a commit inside `path` says that goes, and move its files to their places; twice does the same."""
+    """Delete the files that the commit folder inside `path` lists, and move its own files to their places in `path`.
+
+    It can be killed anywhere and run again: what is done already is passed over.
+    """
     commit = path / _COMMIT
     new = {file.relative_to(commit) for file in _list_files(commit)} - {Path(_GOES)}
     if (commit / _GOES).is_file():
@@ -155,7 +176,7 @@ def _finish_commit(path: Path) -> None:
 
 
 def _list_files(folder: Path) -> Iterator[Path]:
-    """Yield everything in a folder but its folders, links and empty folders included, scratch folders left out."""
+    """Yield all files, links and empty folders at any depth of a folder, sorted; not our scratch folders and locks."""
     for entry in sorted(folder.iterdir()):
         if entry.name.startswith((f".{folder.name}.stitch-", f".{folder.name}.lock", _COMMIT)):
             continue
@@ -166,7 +187,11 @@ def _list_files(folder: Path) -> Iterator[Path]:
 
 
 def _preserve_file(file: Path, place: Path) -> None:
-    """Make `place` the same file, link or empty folder as `file`: linked where the file system can, else copied."""
+    """Make `place` the same file, link or empty folder as `file`: a hard link where the file system can, else a copy.
+
+    Args:
+        place: a path that does not exist yet; folders above it are made.
+    """
     place.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir() and not file.is_symlink():
         place.mkdir(exist_ok=True)
@@ -181,7 +206,7 @@ def _preserve_file(file: Path, place: Path) -> None:
 
 
 def exchange_paths(first: Path, second: Path) -> bool:
-    """Exchange two existing paths of one file system; False where the system or the file system cannot.
+    """Exchange two existing paths of one file system in one step; return False where that is not possible.
 
     Source: renameat2(2) of Linux, renamex_np(2) of macOS.
     """
@@ -197,15 +222,16 @@ def exchange_paths(first: Path, second: Path) -> bool:
 
 @contextmanager
 def only_writer(lock: Path, what: Path) -> Iterator[None]:
-    """Hold the file `lock` while the block runs; the system lets it go when the process ends, however it ends.
+    """Hold a lock on the file `lock` while the block runs; the system releases it if the process is killed.
 
-    A block inside a block of the same process holds it with it.
+    A block nested in another one of the same process enters at once: the outermost one releases the lock.
 
     Args:
-        what: what is written, for the message.
+        lock: file that is made for the lock and removed after it.
+        what: path that is written under the lock, for the message.
 
     Raises:
-        BusyError: another process holds it.
+        BusyError: another process holds the lock.
     """
     if lock in _held:
         _held[lock] += 1
@@ -214,31 +240,38 @@ def only_writer(lock: Path, what: Path) -> Iterator[None]:
         finally:
             _held[lock] -= 1
         return
-    descriptor = _locked(lock, what)
+    descriptor = _acquire_lock(lock, what)
     _held[lock] = 1
     try:
         yield
     finally:
         del _held[lock]
-        _let_go(lock, descriptor)
+        _release_lock(lock, descriptor)
 
 
-def _let_go(lock: Path, descriptor: int) -> None:
-    """Close and remove a lock that this process holds, so that no other process gets one that is gone."""
-    if ON_WINDOWS:  # where no open file can be removed, and one that the next writer has opened stays
+def _release_lock(lock: Path, descriptor: int) -> None:
+    """Remove the file of a lock that this process holds, and release the lock by closing its descriptor."""
+    if ON_WINDOWS:
+        # No open file can be removed there. One that the next writer has opened stays: it is that writer's lock.
         os.close(descriptor)
         with suppress(PermissionError):
             lock.unlink(missing_ok=True)
     else:
+        # Removed while it is locked: whoever opened it before sees, once it has the lock, that the file is gone.
         lock.unlink(missing_ok=True)
         os.close(descriptor)
 
 
-def _locked(lock: Path, what: Path) -> int:
-    """Return the descriptor of a lock, once this process alone holds it.
+def _acquire_lock(lock: Path, what: Path) -> int:
+    """Return the open descriptor of the file `lock`, locked by this process alone; it never waits for another one.
+
+    On a file system without locks the descriptor comes back unlocked.
+
+    Args:
+        what: path that is written under the lock, for the message.
 
     Raises:
-        BusyError: another process holds it, and writes `what`.
+        BusyError: another process holds the lock.
     """
     while True:
         with report_errors_as(what, lock):
@@ -255,7 +288,7 @@ def _locked(lock: Path, what: Path) -> int:
             ) from None
         except OSError:
             return descriptor  # a file system that knows no locks
-        # Its holder may have removed the file between our opening and our locking it.
+        # Its last holder may have removed the file between our opening and our locking it: then open it anew.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), lock.stat()):
                 return descriptor
@@ -264,7 +297,12 @@ def _locked(lock: Path, what: Path) -> int:
 
 @contextmanager
 def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]:
-    """Let errors at `hidden`, a file made for what a person asked for, name `stated`; without `hidden` all do."""
+    """Make errors of the file system inside the block name another path, `stated`.
+
+    Args:
+        stated: the path that a person asked for.
+        hidden: only errors at this path, a scratch file or a lock, are renamed; None: all errors are.
+    """
     try:
         yield
     except OSError as error:
@@ -274,7 +312,10 @@ def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]
 
 
 def sync_to_disk(path: Path) -> None:
-    """Wait until a file, or a folder with all that is in it, is on the disk: after a power cut no name is empty."""
+    """Wait until a file, or a folder with all that is in it, is on the disk.
+
+    Renamed before that, a file could be empty after a power cut. What cannot be opened is passed over.
+    """
     if path.is_symlink():
         return
     if path.is_dir():

@@ -16,7 +16,10 @@ _GLUED = "\N{NO-BREAK SPACE}"
 
 
 def broken_lines(text: str, width: int, hang: int = 0) -> list[str]:
-    """Return a text as lines of at most so many columns, but for words that are longer; blanks at its beginning stay.
+    """Return a text broken between words into lines of at most `width` columns of a terminal.
+
+    A longer word has a line to itself. Blanks at the beginning of the text indent every line. A number stays with its
+    unit.
 
     Args:
         hang: columns by which all lines but the first are indented further.
@@ -28,7 +31,7 @@ def broken_lines(text: str, width: int, hang: int = 0) -> list[str]:
             lines.append(line.rstrip(" "))
             line = margin + " " * hang
         line += f" {word}" if line.strip() else word
-    return [own.replace(_GLUED, " ") for own in (*lines, line)]
+    return [finished.replace(_GLUED, " ") for finished in (*lines, line)]
 
 
 def printable(text: str) -> str:
@@ -40,17 +43,21 @@ class PeopleConsole(Console):
     """A console that breaks long lines between words where `soft_wrap` leaves them to a terminal, which cuts words."""
 
     def print(self, *objects: Any, soft_wrap: bool | None = None, **options: Any) -> None:
-        """Print as rich does; texts printed with `soft_wrap` stay whole words, on what is no terminal whole lines."""
+        """Print as rich does, with characters that would steer a terminal replaced in texts of `soft_wrap`.
+
+        On a terminal those texts are broken between words; in a file or a pipe their lines stay as long as they are.
+        """
 
         def whole_words(text: str) -> str:
+            """Return a text with its long lines broken between words."""
             lines = printable(text).split("\n")
             return "\n".join(part for line in lines for part in broken_lines(line, self.width))
 
         if soft_wrap:
             show = whole_words if self.is_terminal else printable
-            objects = tuple(show(own) if isinstance(own, str) else own for own in objects)
+            objects = tuple(show(item) if isinstance(item, str) else item for item in objects)
         super().print(*objects, soft_wrap=soft_wrap, **options)
 
     def on_broken_pipe(self) -> None:
-        """Whoever reads has seen enough: the rest goes nowhere, and the command still writes its files."""
+        """Discard all further output once the reader of a pipe has closed it: the command still writes its files."""
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())

@@ -26,13 +26,13 @@ _LIBRARIES = {
 
 
 def import_open3d(needed_by: str) -> Any:
-    """Return Open3D with geometry, pipelines and utility: the whole where it is imported already, else without windows.
+    """Return a module with Open3D's geometry, pipelines and utility: its compiled part where that suffices, else all.
 
-    The whole takes 0.9 s and 220 MB, its compiled part a third of both. The latter leaves no module `open3d` behind: a
-    later `import open3d` gives all of it, of the same types.
+    All of Open3D takes 0.9 s and 220 MB to import, its compiled part `open3d.pybind` a third of both. After the latter
+    `import open3d` still works, and gives the same types.
 
     Args:
-        needed_by: what asks for it, for the message.
+        needed_by: the flag, the file or the function that needs it, for the message.
 
     Raises:
         InputError: it is not installed, or a library of the system is missing.
@@ -45,7 +45,10 @@ def import_open3d(needed_by: str) -> Any:
 
 
 def _compiled_part() -> Any:
-    """Return open3d.pybind alone, or None where that is not all it takes: on Windows, and before Open3D 0.20."""
+    """Return the compiled module open3d.pybind, imported without its package; None where that is not possible.
+
+    That is where `open3d` is imported already or not installed, on Windows, and before Open3D 0.20.
+    """
     if "open3d" in sys.modules or sys.platform == "win32":
         return None
     if (loaded := sys.modules.get("open3d.pybind")) is not None:
@@ -53,6 +56,7 @@ def _compiled_part() -> Any:
     spec = find_spec("open3d")
     if spec is None or spec.submodule_search_locations is None:
         return None
+    # Importing open3d.pybind would run open3d/__init__.py first: an empty package stands in for it meanwhile.
     bare = ModuleType("open3d")
     bare.__path__, bare.__spec__ = list(spec.submodule_search_locations), spec
     sys.modules["open3d"] = bare
@@ -63,13 +67,13 @@ def _compiled_part() -> Any:
 
 
 def _remedy(error: Exception) -> tuple[str, str]:
-    """Return why Open3D cannot be imported, and what to do."""
+    """Return why Open3D cannot be imported and the command that mends it, from the error of the import."""
     if isinstance(error, ModuleNotFoundError):
         return "Open3D is not installed", command_for("open3d")
     if packages := missing_packages():
         names = [name for name, package in _LIBRARIES.items() if package in packages]
         return f"Open3D lacks {', '.join(names)} of the system", f"apt-get install {' '.join(packages)}"
-    # The one that is there: open3d-cpu would write over the files of another.
+    # Open3D has several distributions of the same files: install again the one that is there, open3d or open3d-cpu.
     there = next(iter(packages_distributions().get("open3d", ["open3d"])))
     return f"Open3D cannot be imported ({error})", f"pip install --force-reinstall {there}"
 

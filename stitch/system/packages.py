@@ -72,13 +72,18 @@ def stitch_version() -> str:
 
 @cache
 def arrow_alone() -> Any:
-    """Return pyarrow, which at its first list loads pandas where that is installed, a third of a second, to know one of
-    its columns by sight: here no such column comes, and pyarrow asks once. Other threads find pandas meanwhile."""
+    """Return the module pyarrow, kept from importing pandas.
+
+    At its first list pyarrow looks once for pandas, to recognise columns of its types. Where pandas is installed that
+    takes a third of a second, and no such column comes here. Other threads can import pandas meanwhile.
+    """
     import pyarrow
 
     asking = get_ident()
 
     class NoPandas:
+        """A finder of modules that refuses pandas to this thread and leaves all else to the finders after it."""
+
         def find_spec(self, name: str, *_: object) -> None:
             if name == "pandas" and get_ident() == asking:
                 raise ModuleNotFoundError(name=name)
@@ -98,15 +103,19 @@ def command_for(extra: str) -> str:
 
 
 def small_requirements() -> list[str]:
-    """Return SMALL as lines for pip; NumPy from 1.26 on, since a newer one is asked for by the recording alone."""
+    """Return the packages of SMALL as requirements for pip, with the versions that this distribution asks for.
+
+    NumPy may be as old as 1.26: only the recording asks for a newer one, and it is not in SMALL.
+    """
     from importlib.metadata import requires
 
+    # Name in small letters to requirement with its versions.
     asked = {re.match(r"[\w.-]+", line)[0].lower(): line for line in requires(DISTRIBUTION) or ()}  # type: ignore[index]
     return ["numpy>=1.26" if name == "numpy" else asked[name] for name in SMALL]
 
 
 def command_of(name: str) -> str:
-    """Return the command that installs one of PACKAGES: its extra where it has one, else itself."""
+    """Return the pip command that installs one of PACKAGES: by the extra that brings it, else by its own name."""
     from importlib.metadata import requires
 
     for requirement in requires(DISTRIBUTION) or ():
@@ -118,7 +127,10 @@ def command_of(name: str) -> str:
 
 
 def missing_package(error: ModuleNotFoundError) -> str | None:
-    """Return the line for one of PACKAGES that an import did not find; None for anything else."""
+    """Return a line that names the package an import did not find, and how to install it.
+
+    None where that is none of PACKAGES, so that the error is a mistake of the program.
+    """
     top = (error.name or "").partition(".")[0].replace("markupsafe", "jinja2")  # which brings it
     for name, (module, purpose) in PACKAGES.items():
         if module == top:
@@ -128,9 +140,12 @@ def missing_package(error: ModuleNotFoundError) -> str | None:
 
 @contextmanager
 def unless_missing() -> Iterator[None]:
-    """What needs one of PACKAGES that is not installed is left out, with its line as a warning of the logger `stitch`.
+    """End the block early, with a warning of the logger `stitch`, where one of PACKAGES is not installed.
 
     For pictures, pages and recordings: numbers come without them.
+
+    Raises:
+        ModuleNotFoundError: of a module that is none of PACKAGES.
     """
     try:
         yield
@@ -142,11 +157,12 @@ def unless_missing() -> Iterator[None]:
 
 
 def import_extra(name: str, where: Path | str, extra: str) -> Any:
-    """Return a package by its name of import; only some files need it, and an extra of this package installs it.
+    """Return the imported module of an optional package.
 
     Args:
-        where: the file, the flag or what else needs it.
-        extra: of this package.
+        name: of its module.
+        where: the file, the flag or the function that needs it, for the message.
+        extra: of this distribution, by which pip installs the package.
 
     Raises:
         InputError: it is not installed.

@@ -62,7 +62,9 @@ class _Element:
 
 
 def read_ply(path: Path) -> dict[str, Columns]:
-    """Return the properties of every element by name: numbers (N,), mapped to the file where it is binary, or lists.
+    """Return element -> property -> column of a file: numbers (N,), or `Lists` where the property is a list.
+
+    Numbers of a binary file whose element has no lists are a memory map of the file; writes do not reach it.
 
     Raises:
         PlyError: the header cannot be read, or the file ends early.
@@ -112,7 +114,11 @@ def ply_header(elements: Mapping[str, tuple[np.dtype[np.void], int]]) -> bytes:
 
 
 def packed(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """Return rows as they stand in a file: little endian, with the length before each list."""
+    """Return a structured array in the layout of a binary file: little endian, each list after its length as a byte.
+
+    Args:
+        rows: (N,) with fields of single numbers and of k numbers, which become lists of length k.
+    """
     fields = list[tuple[str, Any]]()
     for name in rows.dtype.names or ():
         kind = rows.dtype[name].base.newbyteorder("<")
@@ -130,7 +136,11 @@ def packed(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def _read_header(stream: BinaryIO) -> tuple[str, list[_Element]]:
-    """Return the encoding and the elements; the stream stands behind the header."""
+    """Return the encoding, a key of `_BYTE_ORDERS`, and the elements; the stream moves to the first byte of data.
+
+    Raises:
+        PlyError: it is no PLY, or a line cannot be read.
+    """
     if stream.readline(_LONGEST_HEADER).strip() != b"ply":
         raise PlyError("does not begin with ply")
     encoding = ""
@@ -159,7 +169,15 @@ def _read_header(stream: BinaryIO) -> tuple[str, list[_Element]]:
 
 
 def _map_numbers(path: Path, stream: BinaryIO, element: _Element, order: str) -> Columns:
-    """Return the properties of an element without lists, mapped to the file; the stream moves behind it."""
+    """Return property -> numbers (N,) of a binary element without lists, as a memory map of the file at `path`.
+
+    Args:
+        stream: the same file, at the element's first byte; it moves to the byte after its last.
+        order: "<" or ">", as in dtypes.
+
+    Raises:
+        PlyError: the file ends early.
+    """
     layout = element.layout(order)
     start = stream.tell()
     size = layout.itemsize * element.count
@@ -175,7 +193,14 @@ def _map_numbers(path: Path, stream: BinaryIO, element: _Element, order: str) ->
 
 
 def _read_binary_lists(stream: BinaryIO, element: _Element, order: str) -> Columns:
-    """Return the properties of an element with lists: in one go where all lists of a property are equally long."""
+    """Return property -> column of a binary element with lists; the stream moves to the byte after the element.
+
+    Where all lists of a property are as long as the first, all rows have one layout and are read at once; else each
+    row is walked.
+
+    Args:
+        order: "<" or ">", as in dtypes.
+    """
     start = stream.tell()
     data = stream.read()
     first, _ = _walk_rows(data, replace(element, count=min(element.count, 1)), order)
@@ -197,7 +222,12 @@ def _read_binary_lists(stream: BinaryIO, element: _Element, order: str) -> Colum
 
 
 def _fields_of_row(element: _Element, order: str, lengths: Mapping[str, int]) -> list[tuple[str, Any]]:
-    """Return the fields of a row whose lists have these lengths."""
+    """Return the fields of a dtype for one row: each list property of fixed length, after a field for that length.
+
+    Args:
+        order: "<" or ">", as in dtypes.
+        lengths: list property -> its number of values.
+    """
     fields = list[tuple[str, Any]]()
     for p in element.properties:
         if p.length_kind:
@@ -207,7 +237,15 @@ def _fields_of_row(element: _Element, order: str, lengths: Mapping[str, int]) ->
 
 
 def _walk_rows(data: bytes, element: _Element, order: str) -> tuple[Columns, int]:
-    """Return the properties of an element with lists, read row by row, and the bytes of all rows."""
+    """Return property -> column of an element with lists, read row by row, and how many bytes all rows take.
+
+    Args:
+        data: bytes from the element's first one on; more may follow.
+        order: "<" or ">", as in dtypes.
+
+    Raises:
+        PlyError: the data end early.
+    """
     big = "big" if order == ">" else "little"
     steps = [(p.name, int(p.length_kind[1:]) if p.length_kind else 0, int(p.kind[1:])) for p in element.properties]
     lengths: dict[str, list[int]] = {p.name: [] for p in element.properties}
@@ -230,7 +268,11 @@ def _walk_rows(data: bytes, element: _Element, order: str) -> tuple[Columns, int
 
 
 def _read_text(stream: BinaryIO, element: _Element) -> Columns:
-    """Return the properties of an element in text, a row a line."""
+    """Return property -> column of an element in text, one line a row; the stream moves behind its lines.
+
+    Raises:
+        PlyError: too few lines, a line of another length, or a word that is no number.
+    """
     if not element.count:
         none = np.empty(0)
         return {p.name: Lists(np.empty(0, np.int64), none) if p.length_kind else none for p in element.properties}
@@ -249,7 +291,12 @@ def _read_text(stream: BinaryIO, element: _Element) -> Columns:
 
 
 def _read_text_lists(stream: BinaryIO, element: _Element) -> Columns:
-    """Return the properties of an element in text, of which some are lists."""
+    """Return property -> column of an element in text some of whose properties are lists, one line a row.
+
+    Raises:
+        PlyError: a line is longer than its lists say.
+        ValueError, IndexError: a word is missing or no number.
+    """
     numbers: dict[str, list[str]] = {p.name: [] for p in element.properties}
     lengths: dict[str, list[int]] = {p.name: [] for p in element.properties if p.length_kind}
     for _ in range(element.count):

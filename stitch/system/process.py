@@ -27,7 +27,7 @@ _ends_at_once = False
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Tell `watcher` of every step until the block ends."""
+    """Call `watcher` with (step, done, total) for every step that is announced until the block ends, in any thread."""
     _watchers.append(watcher)
     try:
         yield
@@ -36,11 +36,13 @@ def watched(watcher: Watcher) -> Iterator[None]:
 
 
 def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterator[Item]:
-    """Yield the items, each announced to whoever watches as it is asked for.
+    """Yield the items; before each one, and after the last, tell the watchers how many are done of how many.
+
+    Watchers hear nothing where the number of items is not known.
 
     Args:
         label: what is worked on, in the plural: "scans".
-        total: how many there are, where the items do not say.
+        total: number of items; None: their own length, if they have one.
     """
     count = len(items) if total is None and isinstance(items, Sized) else total
     if not _watchers or count is None:
@@ -53,15 +55,21 @@ def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterat
 
 
 def announce(step: str, done: int = 0, total: int = 0) -> None:
-    """Tell watchers what is worked on next, and how far a loop is."""
+    """Tell all watchers the step that begins, and how many items are done of how many; a total of 0: no loop."""
     for watcher in _watchers:
         watcher(step, done, total)
 
 
 @contextmanager
 def tell_seconds(step: str) -> Iterator[None]:
-    """Say on standard error what the block does and for how long, once it has lasted a while; nothing where another
-    program asked for its own lines (STITCH_PROGRESS)."""
+    """Print on standard error, after QUIET seconds of the block and every AGAIN seconds, the step and its duration.
+
+    A thread prints while the block runs in the caller's. Nothing is printed where the variable STITCH_PROGRESS is set:
+    then another program has asked for progress in its own format.
+
+    Args:
+        step: what the block does, for people.
+    """
     ended = threading.Event()
     begun = time.monotonic()
 
@@ -83,7 +91,10 @@ def tell_seconds(step: str) -> Iterator[None]:
 
 @contextmanager
 def answers_to(stream: Callable[[], IO[str]]) -> Iterator[None]:
-    """While the block lasts, what people read goes to the stream that this returns: it is a command's result."""
+    """Send what people read to the stream that `stream()` returns while the block lasts, not to standard error.
+
+    For commands whose text is their result, and so belongs on standard output.
+    """
     _answers.append(stream)
     try:
         yield
@@ -98,14 +109,17 @@ def answer_stream() -> IO[str] | None:
 
 
 def console(file: IO[str] | None = None) -> Console:
-    """Return standard error, or another stream, that prints names and paths as they are: no markup, no emoji codes."""
+    """Return a rich console on a stream, None: standard error. Names and paths print as they are, without markup."""
     from stitch.system.lines import PeopleConsole
 
     return PeopleConsole(file=file, stderr=file is None, markup=False, emoji=False, highlight=False)
 
 
 def load_on_use(*names: str) -> None:
-    """Let modules of packages be loaded when something of them is asked for, whoever imports them before."""
+    """Register modules, by dotted name, so that importing them is free and their first attribute loads them.
+
+    Modules that are loaded already, or not installed, are passed over.
+    """
     for name in names:
         spec = find_spec(name)
         if name in sys.modules or spec is None or spec.loader is None:
@@ -113,16 +127,16 @@ def load_on_use(*names: str) -> None:
         spec.loader = LazyLoader(spec.loader)
         module = sys.modules[name] = module_from_spec(spec)
         spec.loader.exec_module(module)
-        package, _, own = name.rpartition(".")
-        setattr(sys.modules[package], own, module)
+        package, _, last = name.rpartition(".")
+        setattr(sys.modules[package], last, module)
 
 
 def end_at_once() -> None:
-    """A command that has written and closed all its files: the process may end without giving its memory back."""
+    """Declare that a command has closed all its files: the process may exit at once, without freeing its memory."""
     global _ends_at_once
     _ends_at_once = True
 
 
 def ends_at_once() -> bool:
-    """True after a command has said so."""
+    """True after `end_at_once`."""
     return _ends_at_once

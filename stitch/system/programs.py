@@ -24,10 +24,10 @@ def call_program(
     """Run a program and return what it printed on standard output.
 
     Args:
-        option: that named it, such as "--drive", for messages.
+        option: of our command line that named the program, such as "--drive", for messages.
         command: program and arguments as in a shell.
-        question: goes to its standard input as one JSON object.
-        seconds: after which it is ended.
+        question: goes to its standard input as one JSON object; None: the program inherits our standard input.
+        seconds: after which it is killed; None: it may take any time.
 
     Raises:
         InputError: it cannot be started.

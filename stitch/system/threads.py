@@ -40,16 +40,18 @@ _processes = 1
 
 
 def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> Iterator[Result]:
-    """Return `map` over the cores, results in order; `function` must not call `parallel` itself.
+    """Return an iterator over `function(item)` of all items, in their order, computed by one pool of threads.
+
+    `function` must not call `parallel` itself: it would wait for a thread of the pool that it occupies.
 
     Args:
-        label: what the items are, for whoever watches a long loop.
+        label: what the items are, "scans"; watchers of progress then hear of each. Empty: they hear nothing.
     """
     pool = _pool()
     every = list(items)
     if label:
         return steps(label, pool.map(function, every), len(every))
-    # Thousands of small items would spend as long in being handed out.
+    # Handing thousands of small items to threads one by one would take as long as the work: they go in portions.
     size = max(len(every) // _PORTIONS, 1)
     portions = (every[start : start + size] for start in range(0, len(every), size))
     return chain.from_iterable(pool.map(lambda portion: [function(item) for item in portion], portions))
@@ -57,6 +59,7 @@ def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: s
 
 @cache
 def _pool() -> ThreadPoolExecutor:
+    """Return the pool of this process: a thread per core that is left to it, libraries single-threaded in each."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return ThreadPoolExecutor(
         max_workers=max(cores // _processes, 1), thread_name_prefix="stitch", initializer=library_threads_off
@@ -64,7 +67,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def _forget_threads() -> None:
-    """A forked process knows threads of its parent, ours and those of OpenMP, and would wait for them for ever."""
+    """Drop the pool and OpenMP's threads in a forked process: only the parent has them, and waiting would not end."""
     _pool.cache_clear()
     threadpool_limits(1, user_api="openmp")
 
@@ -74,15 +77,15 @@ if hasattr(os, "register_at_fork"):
 
 
 def share_cores(processes: int) -> None:
-    """Leave the cores to so many processes like this one, before the first `parallel`."""
+    """Size the pool for so many processes like this one that share the cores; call it before the first `parallel`."""
     global _processes
     _processes = processes
 
 
 def begin(function: Callable[[], Result]) -> Future[Result]:
-    """Begin a function in a thread of its own, and return its coming result; it may call `parallel`.
+    """Start a function in a new thread and return the future of its result; the function may call `parallel`.
 
-    A process that ends before does not wait for it: it must not write files.
+    The thread is a daemon: a process that ends does not wait for it, so that the function must not write files.
     """
     future = Future[Result]()
 
@@ -105,10 +108,10 @@ def library_threads_off() -> Any:
 
 @cache
 def return_large_arrays() -> None:
-    """Have the system take arrays of 2 MB and more back as they are freed; nothing where there is no glibc.
+    """Make glibc return arrays of 2 MB and more to the system as soon as they are freed; elsewhere do nothing.
 
-    Else glibc raises that limit to 32 MB by itself, and columns of thousands of poses stay in the heap of every thread,
-    a third more memory than is in use. It costs a fresh mapping for each, which in small sessions is not worth it.
+    By itself glibc raises that limit to 32 MB. Freed arrays of thousands of poses then stay in the heap of every
+    thread: a third more memory than is in use. The price is a new mapping for each array, too much for small sessions.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
@@ -117,9 +120,15 @@ def return_large_arrays() -> None:
 
 
 def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Write parts of the same named columns one after the other; return each column mapped from a file of its own.
+    """Return tables of the same columns joined row after row, each column mapped from a temporary file of its own.
 
-    The files have no name and go with the process.
+    Only one part is in memory at a time. The files have no name, so that they vanish with the process.
+
+    Args:
+        parts: tables as name -> array; under one name all have the same dtype and the same shape but for the rows.
+
+    Returns:
+        Name -> memory map (rows of all parts, ...).
 
     Raises:
         InputError: no room in the folder for temporary files.
@@ -144,7 +153,10 @@ def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[
 
 
 def take_mapped(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Return some rows of an array; of a mapped one little is in memory at a time, and nothing stays."""
+    """Return a copy of the rows of an array at the indices `rows` (K,).
+
+    A memory map is read in `_PARTS` pieces, and what was read of it leaves the memory after each.
+    """
     if not isinstance(array, np.memmap):
         return array[rows]
     taken = np.empty((len(rows), *array.shape[1:]), array.dtype)
@@ -155,40 +167,41 @@ def take_mapped(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def release_mapped(array: NDArray[Any]) -> None:
-    """Give back the memory of a mapped array that was looked at; it comes again from its file. Others stay."""
+    """Free the memory that pages of a memory map take; they are read again when asked for. Other arrays stay."""
     held = getattr(array, "_mmap", None)
     if isinstance(array, np.memmap) and held is not None and hasattr(mmap, "MADV_DONTNEED"):
         held.madvise(mmap.MADV_DONTNEED)
 
 
 class Clock:
-    """Seconds between calls."""
+    """A stopwatch: seconds since the last call of `lap`, at first since it was made."""
 
     def __init__(self) -> None:
         self.last = time.perf_counter()
 
     def lap(self) -> float:
-        """Return seconds since the last call."""
+        """Return the seconds since the last call, or since the clock was made."""
         before = self.last
         self.last = time.perf_counter()
         return self.last - before
 
 
 def remembered(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """Return the function with its result kept on what it is asked of, as `cached_property` keeps one.
+    """Decorate a function of one object: its result is stored in that object's `__dict__`, and computed once for each.
 
-    For what rooms work out of an object of a room below, which cannot name them. Another thread that asks waits.
+    Like `cached_property`, for functions of packages that the object's own package may not import. A lock per function
+    makes a second thread wait for the result of the first.
     """
     key = f"{function.__module__}.{function.__qualname__}"
     lock = RLock()
 
     @wraps(function)
-    def kept(subject: Item) -> Result:
-        """Return what the function makes of a subject, made once and kept with it."""
+    def stored_result(subject: Item) -> Result:
+        """Return the stored result of `function(subject)`, computed first where there is none."""
         with lock:
             values = vars(subject)
             if key not in values:
                 values[key] = function(subject)
             return values[key]
 
-    return kept
+    return stored_result

@@ -36,7 +36,10 @@ class _Call:
 
 @contextmanager
 def time_limit(seconds: float, message: str) -> Iterator[None]:
-    """Raise InputError with `message` in the main thread if the block takes longer."""
+    """Raise InputError with `message` in the main thread if the block takes longer than so many seconds.
+
+    A watching thread sends the signal. Blocks may be nested: only the innermost one of each thread is watched.
+    """
     _start_watch()
     thread = threading.get_ident()
     outer = _running.get(thread)
@@ -51,7 +54,10 @@ def time_limit(seconds: float, message: str) -> Iterator[None]:
 
 
 def may_end_process() -> None:
-    """A call that cannot be interrupted ends the process: right for a command, not for a program that uses stitch."""
+    """Allow the watching thread to end the process where a call does not heed its interruption.
+
+    Right for a command, not for a program that uses this library.
+    """
     global _ends_process
     _ends_process = True
 
@@ -62,7 +68,11 @@ def running_over() -> bool:
 
 
 def _start_watch() -> None:
-    """Start the thread that ends calls which take too long, unless it runs already."""
+    """Start the thread that watches calls, unless it runs already; `time_limit` calls it from the caller's thread.
+
+    Two threads that call at once start two watchers, which does no harm. Only the main thread may install the handler
+    of the alarm: without it calls are not interrupted.
+    """
     global _watch
     if _watch is not None and _watch.is_alive():  # in a process that was forked it is not
         return
@@ -73,13 +83,17 @@ def _start_watch() -> None:
 
 
 def _interrupt_call(*_: Any) -> None:
+    """Raise InputError for an interrupted call: handler of the alarm, which Python runs in the main thread."""
     for call in list(_running.values()):
         if call.interrupted:
             raise InputError(call.message)
 
 
 def _check_calls() -> None:
-    """Interrupt calls that are overdue, and end the process where one does not heed it; runs in a thread of its own."""
+    """Interrupt overdue calls for ever, in the watching thread: by an alarm that raises InputError in the main thread.
+
+    A call that still runs `_GRACE` seconds after its limit ends the process, if `may_end_process` was called.
+    """
     main = threading.main_thread().ident
     while True:
         time.sleep(_STEP)
@@ -87,6 +101,7 @@ def _check_calls() -> None:
         for call in list(_running.values()):
             if not call.interrupted and now > call.due:
                 call.interrupted = True
+                # The program may have installed a handler of its own since: an alarm is not sent to that one.
                 if main is not None and _ALARM is not None and signal.getsignal(_ALARM) is _interrupt_call:
                     signal.pthread_kill(main, _ALARM)
             elif call.interrupted and now > call.due + _GRACE and _ends_process:

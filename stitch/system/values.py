@@ -18,7 +18,10 @@ Item = TypeVar("Item")
 
 
 class Value:
-    """A dataclass that compares by what it holds, arrays included, and becomes plain data; NaN equals NaN."""
+    """A base of dataclasses that compare by what they hold, arrays included, and become plain data; NaN equals NaN.
+
+    A subclass names the function that makes its document, as "module:function": `class Run(Value, document=…)`.
+    """
 
     _document: ClassVar[str] = ""  # module:function that returns the document of one
     _table: ClassVar[str] = ""  # key of the document's rows
@@ -40,7 +43,7 @@ class Value:
         return {name: plain(value) for name, value in self._stored().items()}
 
     def _stored(self) -> dict[str, Any]:
-        """Return what counts when two are compared, by name."""
+        """Return the fields that count in comparisons, name -> value."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}  # type: ignore[arg-type]
 
     def __eq__(self, other: object) -> bool:
@@ -87,12 +90,15 @@ class Table(Value):
 
 
 def take_rows(item: Item, index: Any, *names: str) -> Item:
-    """Return a dataclass with some rows of what its fields of these names hold: arrays, tables of them, or tuples.
+    """Return a copy of a dataclass in which the fields of these names hold only the rows at `index`.
 
-    A field without rows, None or (), stays.
+    Args:
+        index: whatever indexes the first axis of an array; where a field is a tuple, integers.
+        names: fields that hold an array, a dict of arrays, or a tuple. None and () stay as they are.
     """
 
     def rows(held: Any) -> Any:
+        """Return the rows at `index` of the value of one field."""
         if held is None or isinstance(held, tuple):
             return held and tuple(held[i] for i in index)
         return {name: column[index] for name, column in held.items()} if isinstance(held, dict) else held[index]
@@ -101,10 +107,10 @@ def take_rows(item: Item, index: Any, *names: str) -> Item:
 
 
 def same(a: Any, b: Any, within: float = 0.0) -> bool:
-    """Return whether two values hold the same; NaN equals NaN, and arrays are equal where their numbers are.
+    """Return whether two values hold the same at every depth: same types, shapes, keys and numbers; NaN equals NaN.
 
     Args:
-        within: by which numbers may differ, and by which share of themselves.
+        within: tolerance of numbers, absolute and relative, as `rtol` and `atol` of numpy.allclose; 0: exactly equal.
     """
     if a is b:
         return True
@@ -130,11 +136,14 @@ def same(a: Any, b: Any, within: float = 0.0) -> bool:
         return all(same(getattr(a, f.name), getattr(b, f.name), within) for f in fields(a) if f.compare)
     if within and isinstance(a, float):
         return bool(np.isclose(a, b, within, within, equal_nan=True))
-    return bool(a == b) or (a != a and b != b)
+    return bool(a == b) or (a != a and b != b)  # the latter: both are NaN
 
 
 def plain(value: Any) -> Any:
-    """Return a value as numbers, texts, lists and mappings; what is none of these by its name."""
+    """Return a value as plain data for JSON: numbers, texts, lists and dicts, at every depth.
+
+    A function or a class becomes its qualified name; any other object its text.
+    """
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, np.ndarray | np.generic):
