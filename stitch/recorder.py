@@ -88,11 +88,11 @@ class RecorderMemory:
 
 
 class RunMemory(RecorderMemory):
-    """A recorder that stores the calls of several runs, tried one after the other, to replay those of the chosen one."""
+    """A recorder that stores the calls of several runs that are tried in turn, to replay those of the chosen one."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []  # of each run its model and its calls
+        self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []
 
     def start(self, session: SessionData) -> None:
         """Begin to store the calls of another run."""

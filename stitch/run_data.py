@@ -351,7 +351,7 @@ def doubt_headline(doubt: str) -> str:
 
 
 def effect_cure(effect: str) -> str:
-    """Return the words by which a doubt recommends an effect of the model: "add the effect gear_wave"."""
+    """Return the words by which a doubt recommends an effect of the model: "add the effect gear_harmonic"."""
     return f"add the effect {effect}"
 
 
