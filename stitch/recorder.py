@@ -24,11 +24,11 @@ class Recorder(Protocol):
         """Called after each iteration of a stage.
 
         Args:
-            stage: coarse | correct | register | fuse.
+            stage: coarse | correct | register | fuse, or fit: the model's parameters on given correspondences.
             index: of the iteration.
             poses: (V, 4, 4) T_reference_scanner after it.
             rms: of the distances between corresponding points, length_unit.
-            gate: largest distance between two corresponding points, length_unit.
+            gate: largest distance between two corresponding points, length_unit; NaN of labelled points.
         """
         return
 

@@ -1,8 +1,12 @@
-"""Sums over blocks that have one covariance but for a turn: made once for all variances, and for every set of columns.
+"""Sums XᵀV⁻¹Y over blocks whose covariances are equal but for a rotation: made once, for all variances.
 
-Where every view shows the same targets on its flange, what the flange's scatter does to them is the same but for the
-flange's orientation. In numbers turned accordingly all these views have one covariance of a few numbers, and a sum
-XᵀV⁻¹Y over the views is a sum over pairs of those numbers, each times what V⁻¹ says of the pair.
+Where every view shows the same targets on its flange, the scatter of the flange moves them alike but for the flange's
+orientation. A block is one view; its covariance is V_b = Σ_i λ_i C_ib, with variances λ and known components C.
+
+*Turned numbers* of a block are its r coordinates along orthonormal axes that rotate with the flange. In them all blocks
+of a group have one covariance (r, r); in all other directions there is sensor noise alone. So Σ_b X_bᵀV_b⁻¹Y_b is a sum
+over the *pairs* (i ≤ j) of turned numbers: the entry ij of that one inverse, times Σ_b (x_bi y_bj + x_bj y_bi), which
+does not depend on λ. Of t pairs in all, the last two stand for the noise alone and for numbers of known variance.
 """
 
 from collections.abc import Sequence
@@ -25,68 +29,71 @@ _KEPT_NUMBERS = 6_000_000
 
 @dataclass(frozen=True, eq=False)
 class SelectedColumns:
-    """Some of P columns of the n numbers of all blocks."""
+    """A selection of P columns (n, P) over the n numbers of all blocks."""
 
-    whole: Array  # (n, P); what is summed of it is kept: the same object each time
-    keep: Mask | None = None  # (P,); None: all of them, asked once, so that nothing of them is kept
+    whole: Array  # (n, P) all columns; sums are cached under the identity of this array: pass the same object each time
+    keep: Mask | None = None  # (P,) those that are selected; None: all, and nothing of them is cached
 
     @property
     def columns(self) -> Array:
-        """(n, p) those that are selected."""
+        """(n, p) the columns that are selected."""
         return self.whole if self.keep is None or self.keep.all() else self.whole[:, self.keep]
 
     @property
     def count(self) -> int:
-        """How many are selected."""
+        """p, the number of columns that are selected."""
         return self.whole.shape[1] if self.keep is None else int(self.keep.sum())
 
     @property
     def key(self) -> tuple[int | bytes, bytes]:
-        """What tells them from others; for as long as something holds the whole set, where sums of it are kept."""
+        """A key for dictionaries that equal selections share; of cached columns valid while `whole` is alive."""
         return (self.whole.tobytes(), b"") if self.keep is None else (id(self.whole), self.keep.tobytes())
 
     def of(self, values: Array, axis: int) -> Array:
-        """Return what is selected of values for all of them, along an axis."""
+        """Return the entries for the selected columns, from values that have one for each of the P along an axis."""
         return values if self.keep is None or self.keep.all() else values.compress(self.keep, axis)
 
 
 @dataclass(frozen=True)
 class CovarianceGroup:
-    """n blocks whose covariances are one after a turn of their m numbers: r of these scatter, the rest is noise."""
+    """n blocks whose turned numbers have one covariance Σ_i λ_i components[i], in units of the noise's sigma."""
 
     blocks: Indices  # (n,)
-    turn: Array  # (n, r, m) orthonormal rows, of numbers in units of the sensor's noise
+    turn: Array  # (n, r, m) orthonormal rows: turn @ numbers (m,) gives the r turned numbers
     components: Array  # (c, r, r) of the covariance of the turned numbers, the sensor's noise last
 
 
 @dataclass(frozen=True)
 class PairWeights:
-    """At some variances what every pair of turned numbers counts in sums over blocks, and what that gives."""
+    """The inverse covariance at some variances λ, as a weight of each pair of turned numbers, and traces of it."""
 
-    logdet: float  # of the covariance
-    pairs: Array  # (t,)
-    slopes: Array  # (c, t) of the pairs in the variances, negative
+    logdet: float  # log det V of all blocks
+    pairs: Array  # (t,) entry of V⁻¹ for each pair
+    slopes: Array  # (c, t) −∂pairs/∂λ_i, the entries of V⁻¹C_iV⁻¹
     traces: Array  # (c,) tr(V⁻¹C_i)
     curvature: Array  # (c, c) tr(V⁻¹C_iV⁻¹C_j)
 
 
 @dataclass(frozen=True)
 class CommonCovariance:
-    """B blocks of m numbers in groups of one covariance each, and the sums over them that were asked for."""
+    """B blocks of m numbers in groups of one covariance each, with a cache of sums over them."""
 
     groups: Sequence[CovarianceGroup]
-    per_noise: Array  # (B, m) one over the sensor's noise; 0 where the number has none
-    per_known: Array  # (B, m) one over a standard deviation that is known; 0 for all others
-    noise_alone: int  # numbers in all beyond those that scatter
-    logdet: float  # of the units
-    # What is kept, by the identity of the whole set of columns, which is kept with it.
+    per_noise: Array  # (B, m) 1/σ of a unit of sensor noise; 0 where the number has none
+    per_known: Array  # (B, m) 1/σ of numbers whose variance is known; 0 for all others
+    noise_alone: int  # count of directions in all blocks with sensor noise alone
+    logdet: float  # of the units: Σ log of all variances that `per_noise` and `per_known` divide by
+    # Caches by id(whole) of a set of columns; the set itself is held in `_wholes`, so that no other takes its id.
     _wholes: dict[int, Array] = field(default_factory=dict, repr=False)
     _turned: dict[int, list[Array]] = field(default_factory=dict, repr=False)
-    _sizes: dict[int, int] = field(default_factory=dict, repr=False)  # numbers of each
+    _sizes: dict[int, int] = field(default_factory=dict, repr=False)  # count of numbers in `_turned`
     _products: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False)
 
     def weights(self, variances: Array) -> PairWeights:
-        """Return the weights at variances (c,), the sensor's noise last; `logdet` is infinite if V has no inverse."""
+        """Return the weights of all pairs at variances λ (c,), the sensor's noise last.
+
+        Where V has no inverse its `logdet` is infinite, and the rest means nothing.
+        """
         noise = variances[-1]
         count = len(variances)
         logdet = self.logdet + self.noise_alone * float(np.log(noise))
@@ -95,7 +102,7 @@ class CommonCovariance:
         for group in self.groups:
             inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
             W, n = inverse.matrix[0], len(group.blocks)
-            # Every pair of numbers, and each with itself, in the order of `pair_products`.
+            # Pairs i ≤ j, row after row, in the order of `pair_products`; `shares` are V⁻¹C_i, (c, r, r).
             upper = np.triu_indices(len(W))
             shares = W @ group.components
             logdet += n * inverse.logdet
@@ -110,18 +117,21 @@ class CommonCovariance:
         return PairWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
 
     def products(self, a: SelectedColumns, b: SelectedColumns) -> Array:
-        """Return sums (t, p, q) over blocks of the products of two sets of columns, per pair of turned numbers."""
+        """Return the sums over blocks of products of columns a (p) and b (q), per pair of turned numbers: (t, p, q)."""
         if a.keep is None or b.keep is None:
             return pair_products(self.turned(a), self.turned(b))
         return b.of(a.of(self._kept_products(a.whole, b.whole), 1), 2)
 
     def weighted(self, pairs: Array, a: SelectedColumns, b: SelectedColumns) -> Array:
-        """Return the sum (p, q) over the pairs (t,) of kept products, each times its weight."""
+        """Return aᵀV⁻¹b (p, q) from weights of the pairs (t,); the products of columns are cached for other weights."""
         products = self._kept_products(a.whole, b.whole)
         return b.of(a.of((pairs @ products.reshape(len(pairs), -1)).reshape(products.shape[1:]), 0), 1)
 
     def _kept_products(self, a: Array, b: Array) -> Array:
-        """Return the products of two sets of columns by pair of turned numbers, made once for either order."""
+        """Return the products (t, P, Q) of two whole sets of columns (n, P) and (n, Q), from the cache where they are.
+
+        Both orders, ab and ba, are stored.
+        """
         products = self._products.get((id(a), id(b)))
         if products is None:
             products = pair_products(self._kept(a), self._kept(b))
@@ -130,13 +140,16 @@ class CommonCovariance:
         return products
 
     def turned(self, columns: SelectedColumns) -> list[Array]:
-        """Return the columns (k, r, n) of each group, the noise beyond them, and what is known, both (k, 1, B·m)."""
+        """Return p columns of turned numbers: (p, r, n) of each group, then (p, 1, rows) of noise alone and of known.
+
+        Rows are all numbers of all blocks, without their turned part, in units of their sigma.
+        """
         if columns.keep is None:
             return self._turn(columns.whole)
         return [columns.of(part, 0) for part in self._kept(columns.whole)]
 
     def keep(self, wholes: Sequence[Array]) -> None:
-        """Turn sets of columns that will be asked for, at once: so many small products take longer one by one."""
+        """Turn sets of columns (n, P) and cache them: all in one product, since many small ones take longer."""
         new = [
             whole for whole in wholes if id(whole) not in self._turned and (id(whole), id(whole)) not in self._products
         ]
@@ -147,16 +160,19 @@ class CommonCovariance:
                 self._kept(whole, turned)
 
     def _kept(self, whole: Array, turned: list[Array] | None = None) -> list[Array]:
-        """Return columns (n, p) turned by group, and remember them in place of those that were asked for longest ago.
+        """Return the turned columns of a whole set (n, P), and cache them.
+
+        Beyond `_KEPT_NUMBERS` the sets that were asked for longest ago leave the cache.
 
         Args:
-            turned: the same, where they are known already.
+            turned: the result, where the caller has it already.
         """
         turned = turned or self._turned.pop(id(whole), None) or self._turn(whole)
         self._wholes[id(whole)] = whole
         self._turned[id(whole)] = turned
         self._sizes[id(whole)] = sum(part.size for part in turned)
-        # Those that were asked for last stay. Other threads ask as well.
+        # Python's dicts keep the order of insertion: the oldest come first. Copies and defaults, since several threads
+        # share the cache.
         excess = sum(self._sizes.copy().values()) - _KEPT_NUMBERS
         for key in list(self._turned)[:-1]:
             if excess <= 0:
@@ -166,15 +182,17 @@ class CommonCovariance:
         return turned
 
     def _turn(self, columns: Array) -> list[Array]:
-        """Return columns (n, p) turned into the axes in which the blocks of a group have one diagonal covariance.
+        """Return columns (n, p) in turned numbers, in which all blocks of a group have one covariance.
 
         Returns:
-            Of each group, of what is left of the noise, and of what is known, (p, rows, blocks).
+            (p, r, n) of each group of n blocks; then (p, 1, rows) in the directions with noise alone; then (p, 1, rows)
+            of numbers of known variance. All are in units of sigma.
         """
         X = columns.reshape(*self.per_noise.shape, columns.shape[1])
         white = self.per_noise[..., None] * X
         parts = []
         for group in self.groups:
+            # What is taken into turned numbers leaves the rest, in which there is noise alone.
             turned = group.turn @ white[group.blocks]
             white[group.blocks] -= group.turn.transpose(0, 2, 1) @ turned
             parts.append(turned)
@@ -186,26 +204,26 @@ class CommonCovariance:
 
 @dataclass(frozen=True)
 class MeanSums:
-    """Columns of a model's mean, what was seen as the last one, and the sums over blocks of their products."""
+    """The a columns of a model's mean with the observations z as the last one, and sums of their products."""
 
     common: CommonCovariance
-    sets: Sequence[SelectedColumns]
-    known_products: Array | None = None  # `products`, where they were made already
+    sets: Sequence[SelectedColumns]  # a + 1 columns in all, z last
+    known_products: Array | None = None  # the value of `products`, where it is known already
 
     @property
     def are_kept(self) -> bool:
-        """True if sums of all of the columns are kept."""
+        """True if products of these columns with others are cached."""
         return all(columns.keep is not None for columns in self.sets)
 
     @cached_property
     def products(self) -> Array:
-        """(t, a + 1, a + 1) products of all of them."""
+        """(t, a + 1, a + 1) sums over blocks of products of the columns with each other, per pair of turned numbers."""
         if self.known_products is not None:
             return self.known_products
         return np.concatenate([self.products_with(columns) for columns in self.sets], axis=2)
 
     def products_with(self, columns: SelectedColumns) -> Array:
-        """Return their products (t, a + 1, p) with other columns."""
+        """Return the sums over blocks (t, a + 1, p) of products with p other columns, per pair of turned numbers."""
         if columns.keep is None or not self.are_kept:
             return pair_products(self._turned, self.common.turned(columns))
         return np.concatenate([self.common.products(held, columns) for held in self.sets], axis=1)
@@ -215,7 +233,11 @@ class MeanSums:
         return [np.concatenate(parts) for parts in zip(*map(self.common.turned, self.sets), strict=True)]
 
     def products_with_further(self, sets: Sequence[SelectedColumns]) -> Array:
-        """Return products (t, a + g + 1, a + g + 1) of all, with g further columns between mean and what was seen."""
+        """Return products (t, a + g + 1, a + g + 1) of all columns per pair, g further ones between the mean's and z.
+
+        Args:
+            sets: further columns, g in all.
+        """
         if not sets:
             return self.products
         across = np.concatenate([self.products_with(columns) for columns in sets], axis=2)
@@ -231,9 +253,12 @@ class MeanSums:
 
 
 def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
-    """Return sums (t, k, q) over blocks of products, per pair of turned numbers, of columns X and Y as `turned`.
+    """Return the sums over blocks of products of k columns X and q columns Y, per pair of turned numbers: (t, k, q).
 
-    Both orders of a pair count as one: V⁻¹ says the same of them.
+    Of a pair i < j it is Σ_b (x_bi y_bj + x_bj y_bi), since V⁻¹ is symmetric; of i = j, Σ_b x_bi y_bi.
+
+    Args:
+        X, Y: per group (k, r, n) and (q, r, n), as `CommonCovariance.turned` returns them.
     """
     out = []
     for x, y in zip(X, Y, strict=True):
@@ -247,10 +272,14 @@ def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
 
 
 def common_covariance(scattered: Sequence[Array], noise: Array, known: Array) -> CommonCovariance | None:
-    """Return the groups of blocks that have one covariance but for a turn; None where there are none.
+    """Return B blocks of m numbers in groups of one covariance but for a rotation; None where they form none.
+
+    None also where they are few, so that ordinary sums over blocks are as fast. Blocks of one group have the same
+    `noise`; their scatter is held against each other by `_group_of`.
 
     Args:
-        scattered: per component of scatter (V, m, 3) what a unit of it does to the numbers of the first V blocks.
+        scattered: per component of scatter (V, m, 3), by how much a unit of it along each axis moves the numbers of the
+            first V blocks; the others do not scatter.
         noise: (B, m) variance of a unit of sensor noise; 0 where a number has none.
         known: (B, m) variance that is known; 0 elsewhere.
     """
@@ -275,13 +304,19 @@ def common_covariance(scattered: Sequence[Array], noise: Array, known: Array) ->
 
 
 def _group_of(J: Array, blocks: Indices, component: Indices) -> CovarianceGroup | None:
-    """Return some blocks as a group whose covariance is diagonal in one system of axes for each; None if it is not.
+    """Return blocks as a group of one covariance but for a rotation; None if they are not, or imprecisely so.
+
+    Scatter of unit size along s axes moves the numbers of block b by J_b. Where all J_bᵀJ_b = G are equal, the J_b
+    differ by a rotation alone. With G = E Λ Eᵀ the rows of Λ^(−1/2) Eᵀ J_bᵀ are orthonormal: the axes of the turned
+    numbers.
 
     Args:
-        J: (V, m, s) what a unit of scatter along each of s axes does to their numbers, in units of the noise.
-        component: (s,) of each axis.
+        J: (V, m, s) in units of the noise's sigma.
+        blocks: (n,) which of the V.
+        component: (s,) index of the component of the covariance that each axis belongs to.
     """
     every = J[blocks].transpose(0, 2, 1) @ J[blocks]
+    # Axes count in rad and length_unit: all is done in units in which G has a unit diagonal.
     size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
     if (np.abs(every - every[0]) > _SAME * np.outer(size, size)).any():
         return None

@@ -20,7 +20,10 @@ def mad_sigma(e: Array) -> float:
 
 
 def nan_median(values: Array) -> Array:
-    """(n,) medians over the first axis of values (m, n) without their NaN; NaN where there is nothing else."""
+    """Return the medians (n,) of the columns of values (m, n), NaN left out; NaN for a column of NaN alone.
+
+    `numpy.nanmedian` does the same, with a Python call for each column.
+    """
     known = np.isfinite(values).sum(axis=0)
     ordered, column = np.sort(values, axis=0), np.arange(values.shape[1])
     low, high = np.maximum(known - 1, 0) // 2, np.minimum(known // 2, len(values) - 1)
@@ -28,7 +31,7 @@ def nan_median(values: Array) -> Array:
 
 
 def tukey(e: Array, scale: float) -> Array:
-    """Biweight of residuals at a robust sigma."""
+    """Return Tukey's biweights (N,), 0 to 1, of residuals e (N,) of robust sigma `scale`: (1 − (e/(TUKEY·scale))²)²."""
     return np.clip(1 - (e / (TUKEY * scale)) ** 2, 0, None) ** 2
 
 
@@ -48,7 +51,10 @@ def normal_tail(x: float) -> float:
 
 
 def sigmas_among(sigmas: float, count: int) -> float:
-    """Return how many sigmas the farthest of so many normal numbers is worth, one being asked alone (Bonferroni)."""
+    """Return the sigmas that a single normal number needs to be as unlikely as the largest of `count` is at `sigmas`.
+
+    Bonferroni: the upper tails satisfy P(single) = count · P(largest); at most 1/2, so never below 0.
+    """
     chance = np.log(max(count, 1)) + float(special.log_ndtr(-sigmas))
     return float(-special.ndtri_exp(min(chance, np.log(0.5))))
 
@@ -69,7 +75,10 @@ def f_limit(p: float, numerator: float, denominator: float) -> float:
 
 
 def f_limits(p: Array, numerator: float, denominator: float) -> Array:
-    """The F that shares p exceed, exact for tiny ones too: by the beta distribution of d₂/(d₂ + d₁ F)."""
+    """Return the values of F (...) that are exceeded with probabilities p (...), exact for tiny p too.
+
+    By the beta distribution of d₂/(d₂ + d₁ F), with d₁ and d₂ the degrees of freedom of numerator and denominator.
+    """
     share = special.betaincinv(denominator / 2, numerator / 2, p)
     return denominator * (1 - share) / (numerator * share)
 

@@ -26,12 +26,13 @@ _BLOCK = 200
 
 
 def align_points(points: Array, targets: Array, weights: Array | None = None) -> Array:
-    """(..., 4, 4) the rigid motions that bring points (..., N, 3) closest to their targets (..., N, 3).
+    """Return the rigid motions T (..., 4, 4) that minimise Σ wᵢ |T·pointᵢ − targetᵢ|².
 
-    Least squares, by singular values (Arun, Huang & Blostein 1987).
+    By singular value decomposition (Arun, Huang & Blostein 1987).
 
     Args:
-        weights: (N,) on the squares of each; all count alike unless stated.
+        points, targets: (..., N, 3), in their own frames: T maps the frame of the points into that of the targets.
+        weights: (N,) w; None: all are equal.
     """
     share = np.full(points.shape[-2], 1.0) if weights is None else weights
     share = (share / share.sum())[:, None]
@@ -52,25 +53,40 @@ class FeaturedSurface:
 
 
 def voxel_downsample(points: Array, normals: Array, size: float) -> tuple[Array, Array]:
-    """Mean point (M, 3) and unit mean normal (M, 3) of every voxel of edge `size` that holds points."""
+    """Return the mean point (M, 3) and the unit mean normal (M, 3) of every voxel that holds points.
+
+    Args:
+        points, normals: (N, 3), one frame; normals of unit length.
+        size: edge of a voxel, in the unit of the points.
+    """
     _, voxel = np.unique(np.floor((points - points.min(axis=0)) / size).astype(int), axis=0, return_inverse=True)
     voxel = voxel.ravel()
     count = np.bincount(voxel)
 
     def mean(values: Array) -> Array:
+        """Return the mean (M, 3) over the points of each voxel."""
         return np.stack([np.bincount(voxel, column, len(count)) for column in values.T], axis=1) / count[:, None]
 
     return mean(points), _unit(mean(normals))
 
 
 def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurface:
-    """Feature histograms of points (N, 3) with unit normals (N, 3) from up to 99 neighbours within `radius`."""
+    """Return a surface with the fast point feature histogram (FPFH, 33 bins) of each of its points.
+
+    A point's own histogram of angles to its neighbours, plus theirs weighted by 1/distance²; both scaled to the same
+    sum.
+
+    Args:
+        points, normals: (N, 3), one frame; normals of unit length.
+        radius: neighbours are the nearest points within it, 99 at most; in the unit of the points.
+    """
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points)
     count = min(_NEIGHBOURS, len(points))
     distance, index = (a.reshape(len(points), count) for a in tree.query(points, k=count, distance_upper_bound=radius))
     point, column = np.nonzero(np.isfinite(distance) & (distance > 0))
     neighbour = index[point, column].astype(int)
+    # `point` and `neighbour` (P,) list all pairs; each point's query also found the point itself, at distance 0.
     simple = _angle_histograms(points, normals, point, neighbour)
     weight = 1 / distance[point, column] ** 2
     sums = [np.bincount(point, weight * share[neighbour], len(points)) for share in simple.T]
@@ -79,19 +95,23 @@ def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurfac
 
 
 def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: float, draws: int, seed: int = 0) -> Array:
-    """Motion (4, 4) that maps `source` onto `target` by RANSAC over feature partners (Fischler & Bolles 1981).
+    """Return the motion T (4, 4) that maps `source` onto `target`, by RANSAC (Fischler & Bolles 1981).
+
+    Points whose histograms match are partners. Triples of partners drawn at random propose motions; the one with the
+    least cost over all partners is returned (`_msac_costs`).
 
     Args:
-        reach: partners lie at most so far apart under the right motion.
-        draws: triples of partners that are tried.
+        reach: largest distance of two partners under the right motion, in the unit of the points.
+        draws: number of triples.
+        seed: of the random draws.
 
     Returns:
-        The motion of the triple with the least truncated cost; identity where no triple is a rigid copy.
+        The identity where no triple has the same shape in both surfaces.
     """
     in_source, in_target = _partners(source.histograms, target.histograms)
     a, b = source.points[in_source], target.points[in_target]
     triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
-    # Only where the edges have the same length in both.
+    # Only triples whose edges have the same lengths in both surfaces can be a rigid copy.
     edges = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (a[triples], b[triples])]
     triples = triples[(np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1)]
     T = align_points(a[triples], b[triples])
@@ -104,7 +124,15 @@ def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: flo
 
 
 def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach: float) -> Array:
-    """Motion (4, 4) after point-to-plane ICP from `T` (Chen & Medioni 1992); partners lie within `reach`."""
+    """Return the motion (4, 4) that maps `source` onto `target` after point-to-plane ICP (Chen & Medioni 1992).
+
+    It ends when a step is tiny, after `_ICP_STEPS` steps, or where fewer than 6 points have a partner, too few for six
+    unknowns; the last motion is returned in any case.
+
+    Args:
+        T: (4, 4) motion to begin with.
+        reach: largest distance between partners, in the unit of the points.
+    """
     for _ in range(_ICP_STEPS):
         moved = frames.transform(T, source.points)
         distance, index = target.tree.query(moved, k=1, distance_upper_bound=reach)
@@ -124,7 +152,15 @@ def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach:
 
 
 def _angle_histograms(points: Array, normals: Array, point: Indices, neighbour: Indices) -> Array:
-    """(N, 33): of three angles between each point and its neighbours, the shares in 11 bins each."""
+    """Return histograms (N, 33) of three angles between each point's normal and those of its neighbours, 11 bins each.
+
+    The angles θ, arccos α and arccos φ of Rusu, Blodow & Beetz 2009, by the cosines of the latter two; each histogram
+    sums to 100.
+
+    Args:
+        points, normals: (N, 3), normals of unit length.
+        point, neighbour: (P,) indices of the two points of each pair.
+    """
     line = _unit(points[neighbour] - points[point])
     first, second = normals[point], normals[neighbour]
     # The frame sits on that of the two points whose normal lies closer to the line between them.
@@ -143,7 +179,7 @@ def _angle_histograms(points: Array, normals: Array, point: Indices, neighbour: 
 
 
 def _normalised(histograms: Array) -> Array:
-    """Each of the three histograms of a point sums to 100; one without neighbours stays 0."""
+    """Return histograms (N, 33), each of a point's three scaled to sum 100; without neighbours they stay 0."""
     parts = histograms.reshape(len(histograms), 3, _BINS)
     total = parts.sum(axis=2, keepdims=True)
     return (100 * parts / np.where(total > 0, total, 1)).reshape(len(histograms), -1)
@@ -154,7 +190,10 @@ def _unit(vectors: Array) -> Array:
 
 
 def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
-    """Indices of histograms that are each other's nearest; where those are too few, of every one and its nearest."""
+    """Return indices (K,) into histograms a (N, 33) and (K,) into b (M, 33) of pairs that are each other's nearest.
+
+    Where they are fewer than three triples need: each of a, and its nearest of b.
+    """
     forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
     every = np.arange(len(a))
     mutual = back[forth] == every
@@ -162,7 +201,12 @@ def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:
-    """Sum of squared distances, truncated at `reach`, under each motion (K,): MSAC, Torr & Zisserman 2000."""
+    """Return Σ min(|T·a − b|², reach²) over partners for each of K motions: (K,); MSAC, Torr & Zisserman 2000.
+
+    Args:
+        T: (K, 4, 4).
+        a, b: (P, 3) partners; T maps the frame of a into that of b.
+    """
     costs = []
     for block in np.array_split(T, len(T) // _BLOCK + 1):
         # One product for all motions: its rows are the three coordinates of each.

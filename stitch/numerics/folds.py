@@ -22,11 +22,11 @@ _END, _VIEWS_PER_END = 0.2, 20
 
 @dataclass(frozen=True)
 class JointEnd:
-    """Views at one end of what a joint has driven: without them, a model has to extrapolate to them."""
+    """The views at one end of a joint's range: a model fitted without them has to extrapolate to them."""
 
     joint: int  # counted from 0
-    upper: bool
-    views: Indices
+    upper: bool  # the end of the largest angles; False: of the smallest
+    views: Indices  # (K,)
 
     @property
     def name(self) -> str:
@@ -35,11 +35,14 @@ class JointEnd:
 
 
 def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
-    """Return index arrays of the views to leave out together; every view is left out twice where there are enough.
+    """Return folds for cross-validation: index arrays of the views that one fit leaves out together.
+
+    Few views are left out one by one. Else there are `_GROUPS` folds of neighbours in time and as many of neighbours in
+    pose, so that each view is left out twice; folds of more than half of the views are dropped.
 
     Args:
         T_base_flange: (V, 4, 4) in the order of time.
-        lever: length that makes a radian of orientation comparable with a distance.
+        lever: length, length_unit, at which a rotation by 1 rad counts as far as a shift by that length.
     """
     count = len(T_base_flange)
     if count < _FEW:
@@ -50,11 +53,14 @@ def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
 
 
 def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices]]:
-    """Return three ways to halve V views: in the order of time, by the region of their poses, alternately.
+    """Return three ways to split V views in halves: by time, along the main direction of their poses, alternately.
 
     Args:
         T_base_flange: (V, 4, 4) in the order of time.
-        lever: length that makes a radian of orientation comparable with a distance.
+        lever: length, length_unit, at which a rotation by 1 rad counts as far as a shift by that length.
+
+    Returns:
+        Three pairs of sorted indices of views.
     """
     views = np.arange(len(T_base_flange))
     twists = _pose_offsets(T_base_flange, lever)
@@ -66,7 +72,14 @@ def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices
 
 
 def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
-    """Return index arrays of views near each other, every view in one: unknown errors are alike in one place."""
+    """Return index arrays of views with neighbouring poses, each view in exactly one: errors are alike in one place.
+
+    Few views, below `_PLACES`·`_VIEWS_PER_PLACE`, are one group each.
+
+    Args:
+        T_base_flange: (V, 4, 4).
+        lever: length, length_unit, at which a rotation by 1 rad counts as far as a shift by that length.
+    """
     count = len(T_base_flange)
     if count < _PLACES * _VIEWS_PER_PLACE:
         return [np.array([v]) for v in range(count)]
@@ -74,11 +87,14 @@ def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
 
 
 def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
-    """Return both ends of every joint's range; none of a joint that stands still, or where views are few.
+    """Return for each joint the views in the lowest and in the highest fifth of its angles.
+
+    An end is left out where it holds fewer than `_VIEWS_PER_END` views, or more than half of them, as of a joint that
+    stands still.
 
     Args:
         joints: (V, n) rad.
-        observed: indices of the views that show something.
+        observed: (K,) indices of the views that have observations; the others belong to no end.
     """
     out = []
     angles = joints[observed]
@@ -96,11 +112,11 @@ def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
 
 
 def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:
-    """Return groups of views whose poses lie near each other, by k-means; some may be empty.
+    """Return `groups` index arrays of views whose poses lie near each other, by k-means; some may be empty.
 
     Args:
         T_base_flange: (V, 4, 4).
-        lever: length at which a turn counts as a shift, length_unit.
+        lever: length, length_unit, at which a rotation by 1 rad counts as far as a shift by that length.
     """
     twists = _pose_offsets(T_base_flange, lever)
     # Poses that repeat count once, in the order of their first visit: of fewer places than groups k-means would find
@@ -113,5 +129,6 @@ def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:
         from scipy.cluster.vq import kmeans2
 
         _, label = kmeans2(twists[first[order]], min(groups, len(first)), minit="++", seed=0)
+    # Back from poses in the order of their first visit, over sorted poses, to views.
     of_view = label[np.argsort(order)][pose]
     return [np.flatnonzero(of_view == k) for k in range(groups)]

@@ -37,7 +37,7 @@ def make(rotation: Array, translation: Array) -> Array:
 
 
 def _left_jacobian_terms(angle: Array) -> tuple[Array, Array]:
-    """(1−cos θ)/θ² and (θ−sin θ)/θ³, by series near zero."""
+    """Return (1 − cos θ)/θ² and (θ − sin θ)/θ³ of angles θ (...) rad ≥ 0, coefficients of `exp`; by series near 0."""
     small = angle < _SMALL_ANGLE
     safe = np.where(small, 1.0, angle)
     square = angle**2
@@ -47,7 +47,11 @@ def _left_jacobian_terms(angle: Array) -> tuple[Array, Array]:
 
 
 def exp(xi: Array) -> Array:
-    """Exponential of twists (..., 6) -> transforms (..., 4, 4)."""
+    """Exponential of twists (..., 6) -> transforms (..., 4, 4).
+
+    R = 1 + sin θ/θ r̂ + (1 − cos θ)/θ² r̂² and t = V ρ with V = 1 + (1 − cos θ)/θ² r̂ + (θ − sin θ)/θ³ r̂², for the
+    rotation vector r of length θ, its cross-product matrix r̂, and the translation part ρ.
+    """
     xi = np.asarray(xi, float)
     rotation, translation = xi[..., :3], xi[..., 3:]
     angle = np.linalg.norm(rotation, axis=-1)
@@ -62,7 +66,7 @@ def exp(xi: Array) -> Array:
 
 
 def log(T: Array) -> Array:
-    """Logarithm of transforms (..., 4, 4) -> twists (..., 6); rotation angle in [0, π]."""
+    """Logarithm of transforms (..., 4, 4) -> twists (..., 6), the inverse of `exp`; rotation angle in [0, π]."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
     rotation = rotations(R).as_rotvec().reshape(*R.shape[:-2], 3)
@@ -91,9 +95,9 @@ def adjoint(T: Array) -> Array:
 
 
 def left_jacobian(xi: Array) -> Array:
-    """(..., 6, 6) with `exp(ξ + δ) ≈ exp(J δ) · exp(ξ)` for small twists δ, by its series Σ ad(ξ)ⁿ/(n+1)!
+    """Return J (..., 6, 6) with exp(ξ + δ) ≈ exp(J δ) · exp(ξ) for small twists δ (..., 6), at twists ξ (..., 6).
 
-    (Barfoot 7.75). Angles up to 1 rad leave less than 1e-12.
+    By its series Σ ad(ξ)ⁿ/(n+1)! (Barfoot 7.75), up to n = 15: for angles up to 1 rad the rest is below 1e-12.
     """
     xi = np.asarray(xi, float)
     ad = np.zeros((*xi.shape, 6))
@@ -109,7 +113,7 @@ def left_jacobian(xi: Array) -> Array:
 
 
 def transform(T: Array, points: Array) -> Array:
-    """Map points (..., N, 3) by T (..., 4, 4)."""
+    """Return points (..., N, 3) mapped by transforms T (..., 4, 4): R·point + t."""
     T = np.asarray(T, float)
     out = rotate(T, np.atleast_2d(points))
     # By columns: a sum over rows of three takes longer than the product.
@@ -119,7 +123,7 @@ def transform(T: Array, points: Array) -> Array:
 
 
 def rotate(T: Array, vectors: Array) -> Array:
-    """Turn directions (..., N, 3) by the rotation of T (..., 4, 4)."""
+    """Return directions (..., N, 3) turned by the rotations of transforms T (..., 4, 4)."""
     # A factor that lies transposed in memory costs a product of thousands of rows three times as much.
     turned = np.ascontiguousarray(np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2))
     rows = np.asarray(vectors)
@@ -127,7 +131,12 @@ def rotate(T: Array, vectors: Array) -> Array:
 
 
 def plane_rows(arms: Array, normals: Array) -> Array:
-    """(N, 6) by how much a unit twist moves points along normals (N, 3): [arms × normals, normals]."""
+    """Return (N, 6) by how much each component of a twist moves points along their normals: [arms × normals, normals].
+
+    Args:
+        arms: (N, 3) from the point that the twist turns about to each point.
+        normals: (N, 3) of unit length, same frame.
+    """
     # By columns, each in one piece: np.cross over rows of three takes twice as long.
     out = np.empty((6, len(arms)))
     x, y, z = np.ascontiguousarray(arms.T)
@@ -138,7 +147,7 @@ def plane_rows(arms: Array, normals: Array) -> Array:
 
 
 def from_quaternion(position: Array, quaternion: Array) -> Array:
-    """Poses from positions (..., 3) and quaternions (..., 4) in the order x, y, z, w."""
+    """Poses (..., 4, 4) from positions (..., 3) and quaternions (..., 4), order x, y, z, w, of any length but zero."""
     x, y, z, w = np.moveaxis(np.asarray(quaternion, float), -1, 0)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     x, y, z, w = x / length, y / length, z / length, w / length
@@ -158,7 +167,10 @@ def to_quaternion(T: Array) -> Array:
 
 
 def rotations(R: Array) -> Any:
-    """Rotations of scipy from matrices (..., 3, 3); a third of a second to load, in which scans are read already."""
+    """Return rotation matrices (..., 3, 3) as one scipy Rotation over all of them, in a flat order.
+
+    scipy is imported here, as it takes a third of a second to load: other threads read scans meanwhile.
+    """
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(R.reshape(-1, 3, 3))
@@ -167,6 +179,7 @@ def rotations(R: Array) -> Any:
 def nearest_rotation(matrix: Array) -> Array:
     """The rotations (..., 3, 3) closest to matrices (..., 3, 3) in the Frobenius norm (polar factor by SVD)."""
     U, _, Vt = np.linalg.svd(np.asarray(matrix, float))
+    # An improper factor, of determinant −1, loses least when the direction of the smallest singular value is reversed.
     sign = np.linalg.det(U @ Vt)
     U = U.copy()
     U[..., :, 2] *= np.sign(sign)[..., None]
@@ -186,12 +199,16 @@ def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
 def angle_between(T_a: Array, T_b: Array) -> Array:
     """(...,) rotation angle (rad) between transforms (..., 4, 4)."""
     R = np.swapaxes(np.asarray(T_a, float)[..., :3, :3], -1, -2) @ np.asarray(T_b, float)[..., :3, :3]
+    # R − Rᵀ holds 2 sin θ, the trace 1 + 2 cos θ: together exact at every angle, as the arccosine is not.
     twice_sine = np.linalg.norm([R[..., i, j] - R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=0)
     return np.arctan2(twice_sine, np.trace(R, axis1=-2, axis2=-1) - 1)
 
 
 def right_jacobian_inverse(rotation: Array) -> Array:
-    """(3, 3) with log(exp(r)·exp(φ)) = r + J⁻¹φ for a rotation vector r (3,) and a small turn φ (Barfoot, 7.1.4)."""
+    """Return J⁻¹ (3, 3) with log(exp(r)·exp(φ)) ≈ r + J⁻¹φ for rotation vectors r (3,) and small φ, rad.
+
+    Barfoot, section 7.1.4; by its series near r = 0.
+    """
     angle, hat = float(np.linalg.norm(rotation)), skew(rotation)
     if angle < _SMALL_ANGLE:
         return np.eye(3) + hat / 2 + hat @ hat / 12
@@ -199,6 +216,6 @@ def right_jacobian_inverse(rotation: Array) -> Array:
 
 
 def moved_about(centre: Array, twists: Array, T: Array) -> Array:
-    """Return poses T (..., 4, 4) after left twists (..., 6) about a point (3,)."""
+    """Return poses T_a_b (..., 4, 4) moved by twists (..., 6) in frame a that turn about its point `centre` (3,)."""
     to_centre = make(np.eye(3), -centre)
     return inverse(to_centre) @ exp(twists) @ to_centre @ T

@@ -40,8 +40,11 @@ def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
 
     Park & Martin 1994, IEEE Trans. Robotics and Automation 10:717.
 
+    R minimises Σ w |α − R β|² over rotation vectors α of A and β of B; the translation follows by least squares.
+
     Args:
-        weights: (M,) on the squares of each motion.
+        A, B: (M, 4, 4) motions of the mount frame and of the scanner frame between the same views.
+        weights: (M,) w on the squares of each motion; None: all are equal.
 
     Raises:
         NoResultError: no rotation, or rotations about one axis alone.
@@ -59,7 +62,8 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
     where the mount does not translate. Here |vec R|² = 3 is imposed, so motions of every kind serve.
 
     Args:
-        weights: (M,) on the squares of each motion.
+        A, B: (M, 4, 4) motions of the mount frame and of the scanner frame between the same views.
+        weights: (M,) on the squares of each motion; None: all are equal.
 
     Raises:
         NoResultError: no rotation, or rotations about one axis alone.
@@ -68,6 +72,7 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
     eye = np.eye(3)
     # Lengths and rotation entries share one system: count lengths in units of the motions.
     unit = float(np.linalg.norm(weight_roots(A, weights)[:, None] * B[:, :3, 3])) or 1.0
+    # Rows: vec R − (R_A ⊗ R_B) vec R = 0 and (1 ⊗ t_Bᵀ) vec R + (1 − R_A) t = t_A, with row-major vec.
     turned, moved, right = [], [], []
     for a, b, root in zip(A, B, weight_roots(A, weights), strict=True):
         turned += [root * (np.eye(9) - np.kron(a[:3, :3], b[:3, :3])), root * np.kron(eye, b[None, :3, 3]) / unit]
@@ -85,10 +90,11 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
 def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
     """Return X and Z (4, 4) of A·X = Z·B from poses (V, 4, 4), by the Kronecker product (Shah 2013).
 
-    n vec R_X = Σ(R_Bᵀ ⊗ R_Aᵀ) vec R_Z: its first singular pair.
+    R_X and R_Z are the first pair of singular vectors of Σ R_Aᵀ ⊗ R_Bᵀ, made rotations.
 
     Args:
-        weights: (V,) on the squares of each view.
+        A, B: (V, 4, 4) poses of the same views, as T_base_flange and T_board_camera.
+        weights: (V,) on the squares of each view; None: all are equal.
 
     Raises:
         NoResultError: fewer than three poses, or poses that cannot show both; names the axis they share.
@@ -112,7 +118,10 @@ def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array
 
 
 def axis_spread(A: Array) -> Array:
-    """Return singular values (3,) of the stacked rotation axes, each weighted by its angle, over the first."""
+    """Return the singular values (3,) of the rotation vectors of motions A (M, 4, 4), divided by the largest.
+
+    (1, 0, 0): all turn about one axis. (0, 0, 0): none turns.
+    """
     values = np.zeros(3)
     singular = np.linalg.svd(frames.log(np.asarray(A))[:, :3], compute_uv=False)
     values[: len(singular)] = singular
@@ -151,7 +160,14 @@ def weight_roots(A: Array, weights: Array | None) -> Array:
 
 
 def minimise_on_sphere(H: Array, g: Array, radius: float) -> Array:
-    """Return the minimiser of xᵀHx − 2gᵀx with |x| = radius (Gander, Golub & von Matt 1989)."""
+    """Return the x (n,) that minimises xᵀHx − 2gᵀx with |x| = radius (Gander, Golub & von Matt 1989).
+
+    It solves (H − λ) x = g with the smallest real eigenvalue λ of a 2n × 2n matrix; λ is at most that of H.
+
+    Args:
+        H: (n, n) symmetric, positive semidefinite.
+        g: (n,).
+    """
     n = len(H)
     block = np.block([[H, -np.eye(n)], [-np.outer(g, g) / radius**2, H]])
     values, vectors = np.linalg.eigh(H)
@@ -178,9 +194,13 @@ def _solve_translation(left: Array, right: Array, weights: Array | None = None) 
 
 
 def matched_rotations(A: Array, B: Array) -> tuple[Array, Array]:
-    """Return rotation vectors (M, 3) of A and B on the same branch.
+    """Return rotation vectors (M, 3) of A and (M, 3) of B that are rotated copies of each other, rad.
 
-    B's rotation may be taken as the one beyond π about the opposite axis; only motions near a half turn can get that.
+    Near a half turn noise decides about which of two opposite axes a logarithm turns. There B's vector is replaced by
+    the one of 2π − θ about the opposite axis, where that fits A's better.
+
+    Args:
+        A, B: (M, 4, 4) motions of the mount frame and of the scanner frame.
 
     Raises:
         NoResultError: half turns about two axes that fit two different hand-eyes.
@@ -197,7 +217,19 @@ def matched_rotations(A: Array, B: Array) -> tuple[Array, Array]:
 
 
 def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_open: Array) -> Array:
-    """Return a rotation from the widest turn and the one most across it; open signs by the fit of all motions."""
+    """Return R (3, 3) with α ≈ R β, from two motions: the widest turn, and the one most across it.
+
+    A motion near a half turn leaves the sign of its axis open: of the two or four rotations that result, the one that
+    fits all motions best is returned.
+
+    Args:
+        A, B: (M, 4, 4) motions.
+        alpha, beta: (M, 3) their rotation vectors, rad.
+        is_open: (M,) motions near a half turn.
+
+    Raises:
+        NoResultError: a clearly different rotation fits nearly as well.
+    """
     i = int(np.linalg.norm(alpha, axis=1).argmax())
     j = int(np.linalg.norm(np.cross(alpha, alpha[i]), axis=1).argmax())
     signs = [(1.0, -1.0) if is_open[k] else (1.0,) for k in (i, j)]
@@ -206,8 +238,9 @@ def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_open: Arra
     order = np.argsort(scores)
     best = candidates[order[0]]
     for k in order[1:]:
-        apart = np.arccos(np.clip((np.trace(best.T @ candidates[k]) - 1) / 2, -1, 1))
-        if apart > 0.5 and scores[k] < _CLEAR**2 * scores[order[0]] + 1e-16:
+        angle = np.arccos(np.clip((np.trace(best.T @ candidates[k]) - 1) / 2, -1, 1))
+        # Candidates within half a radian are one rotation, found twice; `_misfit` is a square, so the ratio is too.
+        if angle > 0.5 and scores[k] < _CLEAR**2 * scores[order[0]] + 1e-16:
             raise NoResultError(
                 "all motions are half turns and fit two hand-eyes equally well; add views turned by another angle"
             )
@@ -215,9 +248,14 @@ def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_open: Arra
 
 
 def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
-    """Return the rotation from b to a by two directions (TRIAD, Black 1964)."""
+    """Return the rotation R (3, 3) with R b1 ∥ a1, and R b2 in the plane of a1 and a2 (TRIAD, Black 1964).
+
+    Args:
+        a1, a2, b1, b2: (3,) directions of any length.
+    """
 
     def basis(u: Array, v: Array) -> Array:
+        """Return orthonormal axes (3, 3) as columns: x along u, y in the plane of u and v, z across it."""
         x = u / np.linalg.norm(u)
         z = np.cross(x, v)
         z = z / max(float(np.linalg.norm(z)), 1e-300)
@@ -227,7 +265,10 @@ def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
 
 
 def _misfit(A: Array, B: Array, R: Array) -> float:
-    """Return Σ|R_A R − R R_B|² + Σ|(R_A − 1)t − R t_B + t_A|² in units of the motions' size: free of branches."""
+    """Return Σ|R_A R − R R_B|² + Σ|(R_A − 1)t − R t_B + t_A|² of a hand-eye rotation R (3, 3) over motions (M, 4, 4).
+
+    Lengths count in units of the largest translation. Unlike rotation vectors, matrices have no sign left open.
+    """
     rotation = A[:, :3, :3] @ R - R @ B[:, :3, :3]
     t = _hand_eye_translation(A, B, R)
     shift = (A[:, :3, :3] - np.eye(3)) @ t - B[:, :3, 3] @ R.T + A[:, :3, 3]

@@ -28,9 +28,11 @@ _FARTHEST, _NEAREST = 1.0, -0.5
 
 
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
-    """Symmetric matrices (..., k, k) of unit diagonal, and the units (..., k) that make them: rows and columns times
-    these; unknowns count in rad, mm and per hour. Of an unknown with nothing on the diagonal, rounding apart, rows and
-    columns are zero."""
+    """Return symmetric matrices M (..., k, k) scaled to unit diagonal, u_i M_ij u_j, and the units u (..., k).
+
+    Unknowns of mixed units, rad, mm and per hour, then compare. Where the diagonal is zero, row and column become zero
+    and the unit is 1.
+    """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     shown = ~(diagonal <= 1e-300)  # NaN stays
     unit = 1 / np.sqrt(np.where(shown, diagonal, 1.0))
@@ -48,7 +50,10 @@ class InverseCovariance:
 
 
 def invert_covariance(V: Array) -> InverseCovariance:
-    """The inverse of (B, m, m); of a matrix that has none `logdet` is infinite."""
+    """Return the inverses of B covariances V (B, m, m), by Cholesky factors.
+
+    Where one of them is not positive definite or not finite, `logdet` is infinite and the matrices mean nothing.
+    """
     # A search or a leap that ran away ends among infinite variances.
     if not np.isfinite(V).all():
         return InverseCovariance(V, V, np.inf)
@@ -63,7 +68,7 @@ def invert_covariance(V: Array) -> InverseCovariance:
 
 
 def _invert_single(V: Array) -> InverseCovariance:
-    """Return the inverse of the covariance (m, m) of a single block, by LAPACK; determinant inf where it has none."""
+    """Return the inverse of one covariance (m, m), by LAPACK, as B = 1 block; `logdet` infinite where it has none."""
     L, failed = dpotrf(V, lower=1, clean=1)
     if failed:
         return InverseCovariance(V[None], V[None], np.inf)
@@ -76,9 +81,10 @@ def _invert_single(V: Array) -> InverseCovariance:
 
 
 def _invert_blocks(V: Array) -> InverseCovariance:
-    """Return inverse, L⁻¹ and log determinant of many small blocks V (B, m, m); the last is ∞ where one has no inverse.
+    """Return the inverses of many small covariances V (B, m, m); `logdet` is infinite where one has none.
 
-    Cholesky factors of all at once: a library's loop over the blocks takes five times as long.
+    Column j of all Cholesky factors L at once, and row j of all L⁻¹: a library's loop over blocks takes five times as
+    long.
     """
     m = V.shape[1]
     A = np.ascontiguousarray(V.transpose(1, 2, 0))
@@ -96,11 +102,12 @@ def _invert_blocks(V: Array) -> InverseCovariance:
 
 @dataclass(frozen=True)
 class BlockLeastSquares:
-    """z = X·x + noise in B blocks of m, with a weak prior; the noise's covariance is known.
+    """Weighted least squares for z = X·x + noise in B blocks of m numbers, with k unknowns x and a prior on them.
 
-    Rows weigh by their own variances (working independence, Liang & Zeger 1986): as long as effects are missing
-    the scatter of the views is not the noise it is taken for, and full weights would trade millimetres at the
-    targets for combinations that only look exact. The covariance of the estimates counts all correlations.
+    Estimates weigh each number by its own variance alone, W = 1/diag(covariance) (working independence, Liang & Zeger
+    1986). As long as effects are missing from X, the true errors are not the noise that the covariance says. Full
+    weights would then trade millimetres at the targets for combinations of numbers that only look exact. The covariance
+    of the estimates does count all correlations.
     """
 
     z: Array  # (B, m)
@@ -116,12 +123,12 @@ class BlockLeastSquares:
 
     @cached_property
     def _rows(self) -> Array:
-        """(B, m, k + 1) columns and numbers in units of the numbers' own sigmas."""
+        """(B, m, k + 1) the rows √W·[X, z]."""
         return np.concatenate([self.X, self.z[..., None]], axis=2) * np.sqrt(self._weights)[..., None]
 
     @cached_property
     def _sums(self) -> Array:
-        """(k + 1, k + 1) of all blocks."""
+        """(k + 1, k + 1) Σ [X, z]ᵀW[X, z] over all blocks."""
         rows = self._rows.reshape(-1, self._rows.shape[2])
         return rows.T @ rows
 
@@ -139,13 +146,12 @@ class BlockLeastSquares:
         return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
 
     def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
-        """Return estimates under each prior, without some blocks.
+        """Return the estimates (p,) under each of several priors, fitted without some blocks.
 
         Args:
-            priors: precision (p,), and precision times mean (p,), of the first p of the k columns; others are left out.
-
-        Returns:
-            (p,) for each prior.
+            priors: of each, the precision (p,) and the precision times mean (p,) of the first p of the k unknowns; the
+                others are not in the fit.
+            left_out: indices of blocks; None: all blocks count.
         """
         sums = self._sums
         if left_out is not None:
@@ -155,19 +161,23 @@ class BlockLeastSquares:
         for precision, prior_vector in priors:
             k = len(precision)
             prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
+            # Units from all blocks: what the blocks left out alone show must count as small in the rest.
             unit = equilibrated(self._sums[:k, :k] + prior)[1]
             solutions.append(solve_in_units(sums[:k, :k] + prior, vector, unit))
         return solutions
 
     def estimates_covariance(self) -> Array:
-        """(k, k) of the estimates under the blocks' full covariance."""
+        """Return the covariance (k, k) of the estimates, from the blocks' full covariance C: N⁻¹(XᵀWCWX + Q)N⁻¹.
+
+        N = XᵀWX + Q, with Q the precision of the prior.
+        """
         weighted = self.X * self._weights[..., None]
         spread = np.einsum("bmk,bmn,bnl->kl", weighted, self.covariance, weighted, optimize=True)
         inverse = self._inverse
         return inverse @ (spread + np.diag(self.precision)) @ inverse
 
     def shift_by_errors(self, errors: Array) -> Array:
-        """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
+        """Return (k, q) by how much q unmodelled errors of z, (B, m, q), move the estimates."""
         pulls = np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
         return self._inverse @ pulls
 
@@ -177,12 +187,24 @@ class BlockLeastSquares:
         return _pseudo_inverse(*equilibrated(self.information + np.diag(self.precision)))
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
-        """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
+        """Return the ratio of the jackknife's variance to `covariance`, at least 1: see `grouped_inflation`.
+
+        Args:
+            groups: indices of the blocks that each fit leaves out.
+            covariance: (k, k) of the estimates.
+        """
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
 
 
 def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:
-    """Return x (k,) of matrix·x = vector, symmetric (k, k), in units (k,) of x; in what nothing shows it is zero."""
+    """Return x (k,) of matrix·x = vector (k,), by Cholesky where that is precise, else by a pseudo-inverse.
+
+    Directions with almost no information have x = 0.
+
+    Args:
+        matrix: (k, k) symmetric.
+        unit: (k,) of the unknowns, in which directions compare: see `equilibrated`.
+    """
     scaled = matrix * np.outer(unit, unit)
     root, failed = dpotrf(scaled, lower=1, clean=0)
     if not failed and np.diag(root).min() > _SOLVABLE:
@@ -191,10 +213,10 @@ def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:
 
 
 def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Array:
-    """Return the pseudo-inverse (k, k) of a symmetric matrix: zero in the directions that nothing shows.
+    """Return the pseudo-inverse (k, k) of a symmetric matrix: zero in directions of almost no information.
 
     Args:
-        scaled: (k, k) matrix·unit·unitᵀ: the matrix in units of its unknowns, in which directions compare.
+        scaled: (k, k) the matrix in units of its unknowns, in which directions compare: unit_i M_ij unit_j.
         unit: (k,) of each unknown.
         relative: eigenvalues below this share of the largest count as zero.
     """
@@ -206,18 +228,24 @@ def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Arra
 
 @dataclass(frozen=True)
 class GeneralisedFit:
-    """Generalised least squares with a prior: what was seen (n,) to a unknowns."""
+    """Generalised least squares with a prior, solved for any n observations: estimates of a unknowns."""
 
     gain: Array  # (a, n)
     covariance: Array  # (a, a)
 
     def solve(self, z: Array, prior_vector: Array) -> Array:
-        """(a,) from what was seen (n,), and the prior's precision times its middle (a,)."""
+        """Return estimates (a,) from observations z (n,) and the prior's precision times its mean (a,)."""
         return self.gain @ z + self.covariance @ prior_vector
 
 
 def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
-    """Columns (n, a) under noise of covariance (n, n), with a prior of a precision (a, a); units may be mixed."""
+    """Return the generalised least-squares fit of z = columns·x + noise; units may be mixed.
+
+    Args:
+        noise: (n, n) covariance, positive definite.
+        columns: (n, a).
+        precision: (a, a) of the prior of x.
+    """
     weighted = cho_solve(cho_factor(noise, lower=True), columns)
     scaled, unit = equilibrated(columns.T @ weighted + precision)
     covariance = np.linalg.inv(scaled) * np.outer(unit, unit)
@@ -225,7 +253,11 @@ def generalised_fit(noise: Array, columns: Array, precision: Array) -> Generalis
 
 
 def column_space(columns: Array, relative: float = 1e-9) -> Array:
-    """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
+    """Return an orthonormal basis (n, r) of the space of columns (n, K), each scaled to length 1 first.
+
+    Args:
+        relative: directions whose singular value is below this share of the largest are left out.
+    """
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     if len(scaled) > _MANY_ROWS:
         values, vectors = np.linalg.eigh(scaled.T @ scaled)
@@ -237,13 +269,18 @@ def column_space(columns: Array, relative: float = 1e-9) -> Array:
 
 
 def fit_columns(columns: Array, values: Array) -> Array:
-    """(K,) least squares of columns (n, K), whatever their units, to values (n,)."""
+    """Return x (K,) that minimises |columns·x − values|, for columns (n, K) of mixed units and values (n,)."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     return np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale
 
 
 def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
-    """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
+    """Return x (k,) of matrix·x = −vector: of several, the smallest in units of unit diagonal (`equilibrated`).
+
+    Args:
+        matrix: (k, k) symmetric.
+        relative: directions with eigenvalues below this share of the largest have x = 0.
+    """
     scaled, unit = equilibrated(matrix)
     values, vectors = np.linalg.eigh(scaled)
     keep = values > relative * values[-1]
@@ -266,13 +303,14 @@ def summed_squares(blocks: Array) -> Array:
 
 
 def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:
-    """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
+    """Return a mask (P,) of the parameters that observations tell apart from those chosen before and from `base`.
 
-    The clearest is chosen first (QR with pivoting), so that of two that say the same the better known stays.
+    Parameters are chosen in the order of a QR factorisation with pivoting, the clearest first. One is chosen if its
+    column at its plausible size is at least `threshold` sigmas long, less its projection on those before.
 
     Args:
-        base: (N, a) whitened columns that come first, whatever they say.
-        further: (N, P) whitened columns per unit of their parameters.
+        base: (N, a) columns of parameters that are in the model in any case, in units of the observations' sigma.
+        further: (N, P) columns per unit of each parameter, in the same units.
         sizes: (P,) plausible sizes of the parameters.
     """
     # Pivoting among the rows of a first factor chooses the same; on all N rows scipy reserves N² numbers for it.
@@ -293,11 +331,13 @@ def project_out(base: Array, columns: Array) -> Array:
 
 
 def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
-    """Return the ratio of the mean squares that two models leave, and its standard error over samples.
+    """Return the ratio of the residual sums of squares of two models, and its standard error over samples.
+
+    Ratio estimator: Σ with_it / Σ without, with the error from the samples' departures from it.
 
     Args:
         with_it: (G,) sum of squares of each sample, a group of views or one view, under the first model.
-        without: (G,) under the second, by which is divided.
+        without: (G,) the same under the second model.
     """
     share = float(with_it.sum() / max(without.sum(), 1e-300))
     spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
@@ -305,12 +345,14 @@ def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
 
 
 def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
-    """True if the first are less by more than chance would make them; views where either is not finite do not count.
+    """Return True if one model's mean square over all views is significantly less than another's.
+
+    Views where either is not finite do not count.
 
     Args:
-        squares: (V,) mean square of each view under one model.
-        others: (V,) under another.
-        chance: one-sided, of the normal distribution.
+        squares: (V,) mean square of each view under the one model.
+        others: (V,) under the other.
+        chance: probability of True where the models are equally good, one-sided, of a normal distribution.
     """
     seen = np.isfinite(squares) & np.isfinite(others)
     share, sigma = mean_square_share(squares[seen], others[seen])
@@ -318,13 +360,14 @@ def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
 
 
 def grouped_inflation(left_out: Array, covariance: Array) -> float:
-    """Return a factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
+    """Return the factor, at least 1, by which a covariance has to grow to be that of the jackknife.
 
-    How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
+    The jackknife's variance, (G − 1)/G Σ (estimate − mean)², over the model's, averaged over the eigenvectors of the
+    covariance (Efron & Stein 1981). 1 where there are fewer than `_FEWEST` groups.
 
     Args:
-        left_out: (G, K) estimates with one group of samples left out.
-        covariance: (K, K) of the estimates.
+        left_out: (G, K) estimates of K unknowns, each with one group of samples left out.
+        covariance: (K, K) of the estimates by the model.
     """
     count = len(left_out)
     if count < _FEWEST:
@@ -338,15 +381,16 @@ def grouped_inflation(left_out: Array, covariance: Array) -> float:
 
 
 def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
-    """Return the step (N,) to take, from what two iterations in turn ask for: Anderson acceleration, memory one step.
+    """Return the step (N,) to take by Anderson acceleration with a memory of one step, for fixed-point iterations.
 
-    Partners follow a view that moves, so that every step of point-to-plane matching leaves the same share of the way
-    undone. Two steps tell that share, and the next one makes up for it (Anderson 1965; for ICP: Pavlov et al. 2018).
+    Corresponding points follow a view that moves, so that each step of point-to-plane matching leaves the same share
+    of the way undone. Two steps in turn reveal that share, and the next one makes up for it (Anderson 1965; for ICP:
+    Pavlov et al. 2018).
 
     Args:
-        step: (N,) what the present iteration asks for, all components in one unit.
-        last_step: (N,) what the iteration before asked for.
-        last_taken: (N,) the step that was taken then.
+        step: (N,) that the present iteration proposes, all components in one unit.
+        last_step: (N,) that the iteration before proposed.
+        last_taken: (N,) that was taken in its place.
     """
     change = step - last_step
     square = float(change @ change)

@@ -41,7 +41,12 @@ def size_of_scan(points: Array) -> float:
 
 
 def is_stream(T_reference_mount: Array, scans: Sequence[Array]) -> bool:
-    """Return whether poses (V, 4, 4) and scans, (N, 3) each, move on in small steps."""
+    """Return True if a scanner never stopped: almost all steps from scan to scan are small.
+
+    Args:
+        T_reference_mount: (V, 4, 4) poses of what carries the scanner, from the robot.
+        scans: V arrays of points (N, 3), scanner frame.
+    """
     if len(scans) < _FEWEST:
         return False
     middle = np.array([points.mean(axis=0) for points in scans])
@@ -56,13 +61,14 @@ def scan_odometry(
     interval: float = 1.0,
     predicted: Array | None = None,
 ) -> Array:
-    """Return T_first_scanner (V, 4, 4) of every scan of a stream.
+    """Return T_first_scanner (V, 4, 4), in length_unit, of a scanner that never stopped, from its scans alone.
 
     Args:
-        scans: points (N, 3) each, scanner frame.
-        times: s from the time of its scan to each point (N,), of a scanner that moved meanwhile; None: it stood still.
+        scans: V arrays of points (N, 3), scanner frame.
+        times: V arrays (N,) of s from the time of the scan to each of its points, of a scanner that moves meanwhile;
+            None: all points of a scan have one time.
         interval: s from one scan to the next.
-        predicted: (V - 1, 4, 4) motions of the scanner from scan to scan; None: it moves on as it did last.
+        predicted: (V - 1, 4, 4) motions from scan to scan, with which each search begins; None: the last motion found.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
@@ -96,16 +102,17 @@ def hand_eye_of_stream(
     interval: float,
     T_mount: Array | None,
 ) -> tuple[Array | None, Array]:
-    """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream, and the odometry, T_first_scanner (V, 4, 4).
+    """Return T_mount (4, 4) of a scanner that never stopped, from A·X = X·B, and its odometry T_first_scanner.
 
-    Where the scans show little, as along an edge, the robot says where the next one is to be sought. That needs a
-    hand-eye: the stated one, or that of a first pass, which goes on as it moved last. None: the odometry does not turn
-    as the robot does.
+    Two passes of the odometry. Where the scans show little, as along an edge, motions predicted from the robot help;
+    they need a hand-eye: the stated one, or the one that the pass before found. T_mount is None where the odometry
+    fails: its motions turn by other angles than the robot's.
 
     Args:
-        T_reference_mount: (V, 4, 4) from the robot.
-        times, interval: as for `scan_odometry`.
-        T_mount: (4, 4) hand-eye to begin with, off by some per cent of the distance to the part; None: not known.
+        T_reference_mount: (V, 4, 4) poses of what carries the scanner, from the robot.
+        scans, times, interval: as for `scan_odometry`.
+        T_mount: (4, 4) maps scanner to mount, to begin with; within some per cent of the distance to the part. None:
+            not known, and the first pass predicts each motion by the last.
     """
     steps = motions_between(T_reference_mount, [(v, v + 1) for v in range(len(scans) - 1)])
     for _ in range(_PASSES):
@@ -122,9 +129,10 @@ def hand_eye_of_stream(
 
 
 class _ToTheTimeOfTheScan:
-    """KISS-ICP's de-skew for scans that take a part of the interval, brought to the time of the scan.
+    """A preprocessor for KISS-ICP that moves the points of each scan to where the scanner saw them at the scan's time.
 
-    Its own takes a scan to last until the next one, and brings it to its last point.
+    KISS-ICP's own takes for granted that a scan lasts until the next one, and refers its points to the time of the last
+    one. This one corrects both, by a scaled motion and a shift in time.
     """
 
     def __init__(self, preprocessor: Any, interval: float) -> None:
@@ -132,7 +140,13 @@ class _ToTheTimeOfTheScan:
         self._interval = interval
 
     def preprocess(self, points: Array, times: Array, T_last_now: Array) -> Array:
-        """Return points (N, 3) as seen from where the scanner was at time 0."""
+        """Return points (N, 3) in the frame of the scanner at time 0, the time of the scan.
+
+        Args:
+            points: (N, 3) each in the frame of the scanner at its own time.
+            times: (N,) s after the time of the scan; empty: all points have that time.
+            T_last_now: (4, 4) motion of the scanner from the last scan to this one.
+        """
         if not len(times):
             return self._preprocessor.preprocess(points, times, T_last_now)
         velocity = frames.log(T_last_now) / self._interval
@@ -141,10 +155,15 @@ class _ToTheTimeOfTheScan:
 
 
 def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array, Array]:
-    """Return (A, B), each (M, 4, 4): motions of the mount and of the scanner between views where the robot turned.
+    """Return motions A of the mount and B of the scanner, each (M, 4, 4), for A·X = X·B.
 
-    Both turn by the same angle, whatever the hand-eye is (Chen 1991). A step that went wrong spoils every motion across
-    it: the half whose angles agree best is kept.
+    Between views some strides apart, where the robot turned by more than `_TURNED`. A and B turn by the same angle,
+    whatever the hand-eye is (Chen 1991). A wrong step of the odometry spoils every motion across it: only the half of
+    the motions whose angles agree best is returned.
+
+    Args:
+        T_reference_mount: (V, 4, 4) poses of what carries the scanner, from the robot.
+        odometry: (V, 4, 4) T_first_scanner from the scans.
     """
     V = len(T_reference_mount)
     strides = sorted({max(1, round(share * V)) for share in _STRIDES})
@@ -153,10 +172,10 @@ def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array,
     turned = frames.angle_between(T_reference_mount[v], T_reference_mount[w]) > _TURNED
     pairs = list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
     A, B = motions_between(T_reference_mount, pairs), motions_between(odometry, pairs)
-    apart = angle_differences(A, B)
+    mismatch = angle_differences(A, B)
     half = -(-len(pairs) // 2)  # rounded up
-    kept = np.sort(np.argsort(apart, kind="stable")[:half])
-    return A[kept], B[kept]
+    best = np.sort(np.argsort(mismatch, kind="stable")[:half])
+    return A[best], B[best]
 
 
 def angle_differences(A: Array, B: Array) -> Array:

@@ -35,13 +35,15 @@ _EVEN_ODDS = 0.5
 
 
 def log_evidence(information: Array, vector: Array, precision: Array | None = None, mean: Array | None = None) -> Array:
-    """(...) log of the likelihood, vᵀθ − ½ θᵀIθ, integrated over a normal prior of the amplitudes θ (..., k).
+    """Return (...) log ∫ exp(vᵀθ − ½ θᵀIθ) p(θ) dθ, with a normal prior p of the amplitudes θ (k,).
+
+    It is the log Bayes factor of the amplitudes over θ = 0.
 
     Args:
-        information: (..., k, k) I.
-        vector: (..., k) v.
-        precision: (k, k) of the prior; one unless stated.
-        mean: (k,) of the prior; zero unless stated.
+        information: (..., k, k) I of the log likelihood.
+        vector: (..., k) v of the log likelihood.
+        precision: (k, k) inverse covariance of the prior; None: unit matrix.
+        mean: (k,) of the prior; None: zero.
     """
     # In units of the prior: amplitudes may differ by powers of ten.
     P, unit = equilibrated(np.eye(vector.shape[-1]) if precision is None else precision)
@@ -53,7 +55,13 @@ def log_evidence(information: Array, vector: Array, precision: Array | None = No
 
 
 def log_evidence_at_scales(information: Array, vector: Array, scales: dict[float, float]) -> Array:
-    """(s,) the same for a normal prior of unit size times each of the scales."""
+    """Return (s,) log ∫ exp(vᵀθ − ½ θᵀIθ) p(θ) dθ, for priors p of mean 0 and standard deviations `scales`.
+
+    Args:
+        information: (k, k) I of the log likelihood, θ in units of plausible size.
+        vector: (k,) v of the log likelihood.
+        scales: standard deviations; the weights of the mixture, its values, are not used here.
+    """
     out, k = np.zeros(len(scales)), len(vector)
     for i, scale in enumerate(scales if k else ()):
         both = scale**2 * information
@@ -76,22 +84,25 @@ def log_mean_exp(logs: Sequence[float] | Array) -> Array:
 
 @dataclass(frozen=True)
 class WhitenedData:
-    """An observation in units of its scatter."""
+    """The linear model z = base·b + further·p + e in units of its scatter: cov e = 1."""
 
     base: Array  # (N, a) columns of what is fitted in any case: hand-eye, landmarks
-    further: Array  # (N, P) columns per unit of the effects' parameters
-    z: Array  # (N,) what was seen, without the effects
+    further: Array  # (N, P) columns per unit of the effects' parameters p
+    z: Array  # (N,) observations less the prediction without effects
 
 
 def select_supported(
     whitened: WhitenedData, sizes: Array, groups: Sequence[Sequence[int]], effects: Sequence[int]
 ) -> Mask:
-    """(P,) bool: parameters that are fitted; of every effect at least its best group.
+    """Return a mask (P,) of the parameters to fit: the set of groups with the greatest evidence that was found.
+
+    Forward selection followed by elimination, and elimination from all: the better of the two. An effect without a
+    chosen group gets its best one, since it was asked for.
 
     Args:
-        sizes: (P,) plausible sizes.
-        groups: indices of parameters that stand or fall together; one may hold another.
-        effects: number of the effect that each group belongs to.
+        sizes: (P,) plausible sizes: standard deviations of the prior.
+        groups: of each, the indices of parameters that are fitted together; a group may contain another.
+        effects: of each group, the index of its effect.
     """
     G = project_out(whitened.base, whitened.further * sizes)
     y = project_out(whitened.base, whitened.z[:, None])[:, 0]
@@ -99,10 +110,12 @@ def select_supported(
 
     @cache
     def gain_of(*index: int) -> float:
+        """Return the log Bayes factor, nats, of these parameters over none."""
         information, vector = M[np.ix_(index, index)], v[list(index)]
         return log_mixture(log_evidence_at_scales(information, vector, PLAUSIBLE), PLAUSIBLE)
 
     def gain(chosen: Sequence[int]) -> float:
+        """Return the log Bayes factor, nats, of all parameters of these groups over none."""
         return gain_of(*sorted({i for k in chosen for i in groups[k]}))
 
     every = list(range(len(groups)))
@@ -113,6 +126,7 @@ def select_supported(
     for effect in dict.fromkeys(effects):
         if not any(effects[k] == effect for k in chosen):
             of_effect = [k for k in every if effects[k] == effect]
+            # A group of which the views show something goes before one that would only borrow from the hand-eye.
             chosen.append(max(of_effect, key=lambda k: (seen[groups[k]].any(), gain([*chosen, k]))))
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
@@ -120,21 +134,24 @@ def select_supported(
 
 
 def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Indices) -> Array:
-    """(P,) rms that parameters left at zero may well have, beside those that are fitted; zero for these.
+    """Return the rms (P,) that parameters left out of the fit may have, in their own units; 0 for those in the fit.
 
-    Each may be there or not: with probability π it has the mean μ and the sigma σ that the views give it, so that its
-    mean square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999). What to expect before they are asked the
-    other parameters of its effect tell, each as far as the views tell it: how many of them are there, beside one at
-    even odds (Jeffreys' prior of a share), and how large those are, beside one of plausible size (credibility; Bühlmann
-    1967, ASTIN Bulletin 4:199). Where one joint of five is off, a sixth that nobody sees is likelier right than off;
-    where all are off, it is so too.
+    A parameter is present with probability π; then it has the mean μ and the sigma σ that the views give it. Its mean
+    square is π(μ² + σ²) (Bayesian model averaging; Hoeting et al. 1999).
+
+    The prior of π and of the size comes from the other parameters of the same effect, each weighted by how well the
+    views show it. The share of those present, with one more at even odds, is the prior of π (Jeffreys). Their mean
+    square, with one more of plausible size, is the prior's variance (credibility; Bühlmann 1967, ASTIN Bulletin 4:199).
+    So, where one joint of five is off, an unobserved sixth is likelier right than off; where all five are, it is off.
 
     Args:
+        whitened: the model with all parameters.
         sizes: (P,) plausible sizes.
-        fitted: (P,) bool.
+        fitted: (P,) True for parameters in the fit.
         effects: (P,) index of the effect that each belongs to.
     """
     information, pull = _marginal_information(whitened, sizes, fitted)
+    # From 0, unobserved, to 1; then twice: odds under the usual prior, and under the one that the others give.
     seen = information / (1 + information)
     gain, square = _inclusion_odds(information, pull)
     others = np.equal.outer(effects, effects) & ~np.eye(len(sizes), dtype=bool)
@@ -147,16 +164,30 @@ def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Ind
 
 
 def _inclusion_odds(precision: Array, vector: Array) -> tuple[Array, Array]:
-    """(P,) log odds that a parameter of standard normal prior has over none, and its mean square if it is there."""
+    """Return log odds (P,) that parameters are present, at even prior odds, and their mean squares (P,) if they are.
+
+    Each by itself, with a standard normal prior.
+
+    Args:
+        precision: (P,) information I of each in the log likelihood vθ − ½Iθ².
+        vector: (P,) v.
+    """
     mean, variance = vector / (1 + precision), 1 / (1 + precision)
     return 0.5 * vector * mean - 0.5 * np.log1p(precision), mean**2 + variance
 
 
 def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) -> tuple[Array, Array]:
-    """(P,) what the views know of every parameter beside all others that are fitted, per plausible size: information,
-    and that times the likeliest value."""
+    """Return information I (P,) on each parameter, all others in the fit being free, and I times its estimate (P,).
+
+    Parameters count in units of their plausible sizes.
+
+    Args:
+        sizes: (P,) plausible sizes.
+        fitted: (P,) True for parameters in the fit.
+    """
 
     def conditioned_on(others: Mask, asked: Mask) -> tuple[Array, Array]:
+        """Return both for the parameters `asked`, each alone beside the base and the parameters `others`."""
         base = np.hstack([whitened.base, whitened.further[:, others]])
         G = project_out(base, whitened.further[:, asked] * sizes[asked])
         y = project_out(base, whitened.z[:, None])[:, 0]
@@ -173,13 +204,13 @@ def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) ->
 def select_forward(
     gain: Callable[[Sequence[int]], float], groups: Sequence[int], begin: Sequence[int] = (), most: int | None = None
 ) -> list[int]:
-    """Return groups of parameters, chosen one after the other: the one that gains most, until none gains enough.
+    """Return groups chosen one by one, that of the largest gain next, until none adds `_LOG_BAYES_FACTOR`.
 
     Args:
-        gain: log Bayes factor of some groups together, nats.
-        groups: to choose from.
-        begin: groups that are in from the start.
-        most: groups in all; None: no limit.
+        gain: log Bayes factor, nats, of a list of groups together over none.
+        groups: indices of the groups to choose from.
+        begin: groups that are chosen from the start.
+        most: largest number of groups, those of `begin` included; None: no limit.
     """
     chosen = list(begin)
     while (left := [k for k in groups if k not in chosen]) and (most is None or len(chosen) < most):
@@ -191,7 +222,14 @@ def select_forward(
 
 
 def eliminate_backward(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
-    """The group that is missed least is left out until all that remain gain enough beside each other."""
+    """Return the groups that remain when the least important ones are left out one by one.
+
+    It ends once leaving out any one would lose `_LOG_BAYES_FACTOR` or more.
+
+    Args:
+        gain: log Bayes factor, nats, of a list of groups together over none.
+        groups: indices of the groups to begin with.
+    """
     chosen = list(groups)
     while chosen:
         rests = [[other for other in chosen if other != k] for k in chosen]

@@ -69,27 +69,30 @@ _NEARLY_NONE, _WELL_KNOWN = -0.8, 200.0
 
 @dataclass(frozen=True)
 class FurtherPrior:
-    """What is believed of components beside scatter and noise, and of the size of scatter."""
+    """Prior of the variances of f further components, those after scatter and noise, and of the scatter's."""
 
-    scales: Array  # (f,) that their σ usually has
+    scales: Array  # (f,) usual σ of each
     shapes: Array  # (f,) of the density near zero: MAY_BE_ABSENT or ALWAYS_PRESENT
-    common_factor: Mask  # (f,) those that are large or small together
-    scatter: tuple[float, float] | None = None  # that σ of rotation and translation usually has; None: not known
+    common_factor: Mask  # (f,) those that share an unknown factor on their usual σ
+    scatter: tuple[float, float] | None = None  # usual σ of rotation and translation scatter; None: not known
 
     def select(self, keep: Mask) -> Self:
         """Return the prior of some components alone (f,)."""
         return replace(self, scales=self.scales[keep], shapes=self.shapes[keep], common_factor=self.common_factor[keep])
 
     def scaled(self, factor: float) -> Self:
-        """Return the prior where all are usually so many times as large."""
+        """Return the prior with all usual σ multiplied by a factor."""
         return replace(self, scales=factor * self.scales)
 
 
 def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float, Array]:
-    """Return −2 log prior of the log variances (c,), and its slope.
+    """Return −2 log of the prior density of the log variances (c,), up to a constant, and its gradient (c,).
 
-    Of the scatter, before NOISE, a gamma(2, 0) prior on σ; of the noise factor at NOISE a normal one of its logarithm
-    about the usual; of each further variance v, with scale s and shape a, v^(a/2) / (1 + v/s²)^((1 + a)/2).
+    Of the scatter, before NOISE, a gamma(2, 0) prior on σ. Of the noise factor, at NOISE, a log-normal one. Of each
+    further variance v, with usual σ s and shape a, v^(a/2) / (1 + v/s²)^((1 + a)/2).
+
+    Args:
+        further: prior of the components after NOISE; None: there are none.
     """
     off = (log_variances[NOISE] - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD
     value = -float(log_variances[:NOISE].sum()) + off**2
@@ -104,9 +107,13 @@ def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float
 
 
 def log_density(component: int, log_variances: Array, further: FurtherPrior | None) -> Array:
-    """Return the log density (g,) of one component at log variances (g,) in equal steps, up to a constant.
+    """Return the log prior density (g,), up to a constant, of one component on a grid of log variances (g,).
 
-    The first of them stands for all below.
+    The grid has equal steps; its first point stands for all smaller variances, zero included. Scatter of known usual
+    size has the prior of a further component that is always present.
+
+    Args:
+        component: index, NOISE or another.
     """
     if component == NOISE:
         return -0.5 * ((log_variances - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD) ** 2
@@ -127,7 +134,10 @@ def log_density(component: int, log_variances: Array, further: FurtherPrior | No
 
 
 def prior_information(variances: Array, further: FurtherPrior | None) -> Array:
-    """Return what the prior alone knows of the log variances (c,): half the curvature of `log_prior`."""
+    """Return the prior's information (c,) on the log variances at variances (c,): half the curvature of `log_prior`.
+
+    The scatter's prior is linear in the log variance: it has none.
+    """
     out = np.zeros(len(variances))
     out[NOISE] = 1 / FACTOR_SPREAD**2
     if further is not None:
@@ -137,10 +147,10 @@ def prior_information(variances: Array, further: FurtherPrior | None) -> Array:
 
 
 def usual_variances(z: Array, components: Array) -> Array:
-    """Return the variances (c,) at which a search begins: what was seen, mostly scatter and noise.
+    """Return variances (c,) to begin a search with: a share of Σz² for each component, 1 for the noise factor.
 
     Args:
-        z: (B, m) numbers that were seen.
+        z: (B, m) observations.
         components: (c, B, m, m) of their covariance.
     """
     traces = np.einsum("cbii->c", components)
@@ -154,12 +164,12 @@ def usual_variances(z: Array, components: Array) -> Array:
 
 @dataclass(frozen=True)
 class MixedModel:
-    """B blocks of m numbers that were seen, the columns of their mean and the components of their covariance."""
+    """The model z = A α + e, cov e = Σ_i λ_i C_i, of observations in B independent blocks of m numbers."""
 
-    z: Array  # (B, m)
-    A: Array  # (B, m, a) columns of the free mean
-    components: Array  # (c, B, m, m) of unit rotation scatter, translation scatter, sensor noise, and further ones
-    fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
+    z: Array  # (B, m) observations
+    A: Array  # (B, m, a) columns of the mean, with free coefficients α
+    components: Array  # (c, B, m, m) C of unit rotation scatter, translation scatter, sensor noise, and further ones
+    fixed: Array | None = None  # (B, m, m) covariance that is known, with 1 on the diagonal of absent numbers; added
     independent: int | None = None  # numbers that could err independently, if that is not all of them
     further: FurtherPrior | None = None  # of the c − 3 further components; None: there are none
     common: CommonCovariance | None = None  # of the same covariances, where many blocks have one but for a turn
@@ -169,17 +179,17 @@ class MixedModel:
 
     @property
     def size(self) -> int:
-        """How many numbers err independently: all of z, unless `independent` says fewer."""
+        """The number of observations that could err independently: all of z, unless `independent` says fewer."""
         return int(self.z.size) if self.independent is None else self.independent
 
     def covariance(self, variances: Array) -> Array:
-        """(B, m, m) for variances (c,)."""
+        """Return the covariance (B, m, m) of z for variances (c,): Σ λ_i C_i + fixed."""
         V = np.einsum("c,cbij->bij", variances, self.components)
         return V if self.fixed is None else V + self.fixed
 
     @cached_property
     def sums(self) -> MeanSums:
-        """Sums over blocks of one covariance of everything in the mean, and of what was seen as the last column."""
+        """Products of the columns of A, and of z as the last one, summed over blocks; needs `common`."""
         if self.known_sums is not None:
             return self.known_sums
         assert self.common is not None
@@ -189,31 +199,31 @@ class MixedModel:
 
 @dataclass(frozen=True)
 class FurtherColumns:
-    """A mixed model and g further columns of its mean, with what any prior of their coefficients has in common."""
+    """A mixed model with g further columns G of its mean, and sums of them that do not depend on a prior."""
 
     mixed: MixedModel
     sets: Sequence[SelectedColumns]
 
     @cached_property
     def G(self) -> Array:
-        """(B, m, g) all of them."""
+        """(B, m, g) the further columns."""
         columns = [selected.columns for selected in self.sets]
         return np.hstack([np.zeros((self.mixed.z.size, 0)), *columns]).reshape(*self.mixed.z.shape, -1)
 
     @cached_property
     def Xz(self) -> Array:
-        """(B, m, a + g + 1) all columns of the mean, and what was seen as the last one."""
+        """(B, m, a + g + 1) all columns of the mean, and z as the last one."""
         return np.concatenate([self.mixed.A, self.G, self.mixed.z[..., None]], axis=2)
 
     @cached_property
     def products(self) -> Array:
-        """(t, a + g + 1, a + g + 1) products of all, in the order of `Xz`."""
+        """(t, a + g + 1, a + g + 1) products of all per pair of turned numbers (`common_covariance`), as in `Xz`."""
         return self.mixed.sums.products_with_further(self.sets)
 
     def in_mean(self) -> MixedModel:
-        """Return the mixed model with the further columns in its free mean, behind those that it has: A (B, m, a + g).
+        """Return the mixed model with the further columns appended to those of its mean: A (B, m, a + g).
 
-        Sums over blocks that were made of either are handed on.
+        Sums over blocks that are known already are handed on to it.
         """
         A = np.concatenate([self.mixed.A, self.G], axis=2)
         if self.mixed.common is None:
@@ -226,17 +236,21 @@ class FurtherColumns:
 
 @dataclass(frozen=True)
 class ModelInformation:
-    """How further columns are asked for beside a model whose blocks have one covariance, at the variances of a fit."""
+    """What the information on further columns needs of a model, at the variances of a fit; X are the model's columns.
+
+    The model has `common`: its blocks have one covariance but for a rotation.
+    """
 
     mixed: MixedModel
-    pairs: Array  # (t,) what every pair of turned numbers counts
-    half: Array  # (a, r) square root of the covariance of its own coefficients
+    pairs: Array  # (t,) weight of every pair of turned numbers: entries of V⁻¹ (`common_covariance`)
+    half: Array  # (a, r) square root of (XᵀV⁻¹X)⁻¹
     seen: Array  # (r,) halfᵀXᵀV⁻¹z
 
     def of(self, columns: SelectedColumns) -> tuple[Array, Array]:
-        """Return I (g, g) and v (g,) of the log likelihood vᵀθ − ½ θᵀIθ of the coefficients θ of further columns.
+        """Return I (g, g) and v (g,) of the log likelihood vᵀθ − ½ θᵀIθ of the coefficients θ of g further columns G.
 
-        The columns are kept; the model's own coefficients are free beside them.
+        I = GᵀPG and v = GᵀPz with P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹: the model's own coefficients are free. Sums of the
+        columns are cached.
         """
         common = self.mixed.sums.common
         *mean, seen = (common.weighted(self.pairs, held, columns) for held in self.mixed.sums.sets)
@@ -245,10 +259,11 @@ class ModelInformation:
 
 
 def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
-    """Return what is needed to ask for further columns beside a model at the variances of a fit.
+    """Return what the information on further columns needs of a model, at the variances of a fit.
 
     Args:
-        fit: of the model, with or without further columns.
+        mixed: a model with `common`.
+        fit: of the model; further columns in it, behind the model's own, are disregarded.
     """
     a = mixed.A.shape[2]
     half, _ = _root_of_inverse(fit.sums[:a, :a])
@@ -258,16 +273,21 @@ def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation
 
 @dataclass(frozen=True)
 class RemlProblem:
-    """A mixed model with further columns of its mean, and their prior."""
+    """A mixed model with further columns of its mean, and the prior of their coefficients."""
 
     mixed: MixedModel
     columns: FurtherColumns
-    precision: Array  # (a + g,) of the prior
-    offset: float  # log det of the prior covariance
+    precision: Array  # (a + g,) 1/σ² of the prior, 0 of free coefficients
+    offset: float  # log det of the prior covariance; 0 without a prior
 
 
 def reml_problem(mixed: MixedModel, G: Array | FurtherColumns | None, prior: Array | None) -> RemlProblem:
-    """Return the problem with further columns G (B, m, g), and standard deviations (g,) of coefficients, if any."""
+    """Return the likelihood to be maximised, of a model with further columns of its mean.
+
+    Args:
+        G: (B, m, g), or the same prepared for several fits; None: no further columns.
+        prior: (g,) standard deviations of their coefficients; None: they are free.
+    """
     if not isinstance(G, FurtherColumns):
         G = FurtherColumns(mixed, () if G is None else (SelectedColumns(flatten_blocks(G)),))
     precision = np.zeros(sum(selected.count for selected in G.sets)) if prior is None else 1 / prior**2
@@ -277,16 +297,19 @@ def reml_problem(mixed: MixedModel, G: Array | FurtherColumns | None, prior: Arr
 
 @dataclass(frozen=True)
 class Likelihood:
-    """The restricted likelihood at some variances, and what is best believed of the mean there."""
+    """The restricted likelihood at some variances, with the estimates of the mean's coefficients β there.
+
+    X = [A, G] are all columns of the mean, M = XᵀV⁻¹X + the prior's precision, W = V⁻¹.
+    """
 
     problem: RemlProblem
-    log_variances: Array  # (c,)
-    deviance: float  # −2 log of it, and of the prior of the log variances
-    mean: Array  # (a + g,) coefficients
-    half: Array  # (a + g, r) square root of their covariance
-    errors: InverseCovariance | PairWeights  # of the numbers
-    sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
-    of_variances: float  # of the deviance, what no mean changes
+    log_variances: Array  # (c,) log λ
+    deviance: float  # −2 log of the restricted likelihood times the prior of the log variances
+    mean: Array  # (a + g,) β
+    half: Array  # (a + g, r) square root of M⁻¹, the covariance of β
+    errors: InverseCovariance | PairWeights  # V⁻¹
+    sums: Array  # (a + g + 1, a + g + 1) [X z]ᵀV⁻¹[X z]
+    of_variances: float  # the terms of the deviance that do not depend on X
     prior_slope: Array  # (c,) of −2 log prior of the log variances
 
     @property
@@ -296,14 +319,16 @@ class Likelihood:
 
     @cached_property
     def slope(self) -> Array:
-        """(c,) of the deviance in the log variances; it takes as long as the deviance itself.
+        """(c,) gradient of the deviance in the log variances; zero where V has no inverse.
 
-        d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
+        d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹XᵀW and r = z − Xβ. Both terms are Σ (P − Wr rᵀW)∘C_i: one
+        matrix `against` every component.
         """
         if not np.isfinite(self.errors.logdet):
             return np.zeros(len(self.log_variances))
         mixed, columns = self.problem.mixed, self.problem.columns
         k, r = self.half.shape
+        # W·[X z]·half_and_rest = [WX·half, Wr]; with its transpose it gives WX M⁻¹XᵀW + Wr rᵀW.
         half_and_rest = np.zeros((k + 1, r + 1))
         half_and_rest[:-1, :-1] = self.half
         half_and_rest[:-1, -1] = -self.mean
@@ -327,10 +352,11 @@ class Likelihood:
 
     @property
     def curvature(self) -> Array:
-        """(c, c) expected of the deviance, but for what the mean takes: λ_iλ_j tr(V⁻¹C_iV⁻¹C_j).
+        """(c, c) approximate second derivatives of the deviance in the log variances, without the prior's.
 
-        Of one large block the average of that and of the observed one: zᵀPC_iPC_jPz takes no product of matrices
-        (Gilmour, Thompson & Cullis 1995, Biometrics 51:1440).
+        Their expectation, with V⁻¹ in place of P: λ_iλ_j tr(V⁻¹C_iV⁻¹C_j). For one large block the average of expected
+        and observed ones, λ_iλ_j zᵀPC_iPC_jPz, which takes no product of matrices (Gilmour, Thompson & Cullis 1995,
+        Biometrics 51:1440).
         """
         variances = np.exp(self.log_variances)
         if is_one_large(self.problem.mixed) and not isinstance(self.errors, PairWeights):
@@ -346,7 +372,7 @@ class Likelihood:
 
     @property
     def _average_information(self) -> Array:
-        """(c, c) zᵀPC_iPC_jPz of one block."""
+        """(c, c) zᵀPC_iPC_jPz of a model of one block, with P = W − WX M⁻¹XᵀW."""
         assert isinstance(self.errors, InverseCovariance)
         X, W = self.problem.columns.Xz[0, :, :-1], self.errors.matrix[0]
         z = self.problem.mixed.z[0]
@@ -357,12 +383,17 @@ class Likelihood:
 
 
 def is_one_large(mixed: MixedModel) -> bool:
-    """Return whether scatter and noise alone are told by one block of hundreds of numbers, as of many views."""
+    """Return True for a model of one block of hundreds of numbers, as of many views, without further components."""
     return len(mixed.z) == 1 and mixed.z.shape[1] > _LARGE_BLOCK and mixed.further is None
 
 
 def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
-    """Return the likelihood; infinitely unlikely, flat, where the covariance has no inverse."""
+    """Return the restricted likelihood at log variances (c,).
+
+    Its −2 log is log det V + log det M + log det S + (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀS⁻¹β − 2 log prior, with the prior
+    covariance S of the further coefficients and M = XᵀV⁻¹X + S⁻¹. Where V has no inverse it is 1e300, with zero slope,
+    which a search steps back from.
+    """
     mixed, columns = problem.mixed, problem.columns
     with np.errstate(over="ignore"):
         variances = np.exp(log_variances)
@@ -386,7 +417,7 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
             sums += white.T @ white
     half, of_information = _root_of_inverse(sums[:k, :k] + np.diag(problem.precision))
     mean = half @ (half.T @ sums[:k, k])
-    # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
+    # Residuals z − Xβ are formed before they are squared where they can be: from `sums` alone digits cancel.
     of_rest = np.append(-mean, 1.0)
     if isinstance(errors, PairWeights):
         square = float(of_rest @ sums @ of_rest)
@@ -402,7 +433,10 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
-    """Return R (k, r) with R Rᵀ = M⁻¹ for M (k, k), and log det M; both without directions that nothing tells of."""
+    """Return R (k, r) with R Rᵀ = M⁻¹ for a symmetric M (k, k), and log det M; both without directions near zero.
+
+    Those are eigenvectors of M, scaled to unit diagonal, with eigenvalues below `_KNOWN`.
+    """
     scaled, unit = equilibrated(M)
     L, failed = dpotrf(scaled, lower=1, clean=1)
     if not failed and len(L) and np.diag(L).min() > CLEARLY_KNOWN:
@@ -423,23 +457,27 @@ def deviance(log_variances: Array, problem: RemlProblem) -> tuple[float, Array]:
 
 
 def flatten_blocks(X: Array) -> Array:
-    """Return (B·m, a) of (B, m, a); a model that is only judged has no columns."""
+    """Return (B·m, a) from (B, m, a), where a may be 0, of which `reshape(-1, 0)` would not know the rows."""
     return X.reshape(X.shape[0] * X.shape[1], X.shape[2])
 
 
 @dataclass(frozen=True)
 class VarianceFit:
-    """The maximum: variances λ (c,), −2 log of the (restricted) likelihood, and the mean's coefficients."""
+    """The maximum of a restricted likelihood over the variances, with the estimates of the mean's coefficients β."""
 
-    variances: Array  # (c,)
-    deviance: float
-    mean: Array  # (a + g,)
-    covariance: Array  # (a + g, a + g)
-    sums: Array  # (a + g + 1, a + g + 1) XᵀV⁻¹X of the mean's columns, and of what was seen as the last one
-    of_variances: float = 0.0  # of the deviance, what no mean changes
+    variances: Array  # (c,) λ
+    deviance: float  # −2 log of the restricted likelihood times the prior of the log variances
+    mean: Array  # (a + g,) β
+    covariance: Array  # (a + g, a + g) of β
+    sums: Array  # (a + g + 1, a + g + 1) [X z]ᵀV⁻¹[X z] of the mean's columns X and the observations z
+    of_variances: float = 0.0  # the terms of the deviance that do not depend on X
 
     def under_prior(self, prior: Array) -> Self:
-        """Return the fit at the same variances, with standard deviations (g,) of the further coefficients."""
+        """Return mean, covariance and deviance at the same variances under another prior of the further coefficients.
+
+        Args:
+            prior: (g,) standard deviations of the last g coefficients; the others are free.
+        """
         precision = np.append(np.zeros(len(self.mean) - len(prior)), prior**-2.0)
         half, of_information = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
         mean = half @ (half.T @ self.sums[:-1, -1])
@@ -456,14 +494,16 @@ def fit_variances(
     start: Array | None = None,
     both_starts: bool = False,
 ) -> VarianceFit:
-    """Return the maximum over the variances; a component that no number has is at variance zero.
+    """Return the maximum of the restricted likelihood over the variances; a component that is zero has variance 0.
+
+    Fisher scoring where it converges, else a search with gradients (L-BFGS-B).
 
     Args:
         G: (B, m, g) further columns of the mean; of the same ones asked several times, `FurtherColumns`.
         prior: (g,) standard deviations of their coefficients; None leaves them free.
         start: (c,) variances to begin with; None starts from the spread of z.
-        both_starts: also begin from noise alone, where the likelihood may have a second maximum; not with one large
-            block, whose numbers are too many for that.
+        both_starts: also begin from noise alone, where the likelihood may have a second maximum, and return the better
+            one; disregarded for one large block, where it would take too long.
     """
     problem = reml_problem(mixed, G, prior)
     usual = usual_variances(mixed.z, mixed.components)
@@ -495,7 +535,12 @@ def fit_variances(
 def at_variances(
     mixed: MixedModel, variances: Array, G: Array | FurtherColumns | None = None, prior: Array | None = None
 ) -> VarianceFit:
-    """Return the same without searching: mean, covariance and deviance for given variances (c,)."""
+    """Return the fit at given variances (c,), without a search: mean, covariance and deviance.
+
+    Args:
+        G: (B, m, g) further columns of the mean, or the same prepared for several fits; None: none.
+        prior: (g,) standard deviations of their coefficients; None: they are free.
+    """
     return _fit_at(reml_problem(mixed, G, prior), np.asarray(variances))
 
 
@@ -509,14 +554,15 @@ def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
 
 
 def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihood | None:
-    """Return the maximum by Fisher scoring, where it lies near; None where a search must look for it.
+    """Return the maximum by Fisher scoring: Newton steps with the expected curvature of the deviance.
 
-    The expected curvature of the deviance is λ_iλ_j tr(V⁻¹C_iV⁻¹C_j), less what the mean takes. With thousands of
-    numbers in small blocks three steps do what a search without curvature needs sixteen for.
+    None where it does not converge within `_SCORINGS` steps, or a step halved `_HALVINGS` times does not improve: then
+    the caller searches. None also for a few blocks, where a search is as fast. With thousands of numbers in small
+    blocks three steps do what a search without curvature needs sixteen for.
 
     Args:
         start: (c,) log variances.
-        flat: slope of the deviance that is none.
+        flat: largest slope of the deviance in a log variance at which the iteration ends.
     """
     mixed = problem.mixed
     if len(mixed.z) < MANY_BLOCKS and not is_one_large(mixed):
@@ -525,6 +571,7 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihoo
     for _ in range(_SCORINGS):
         if np.abs(here.slope).max() < flat:
             return here
+        # By the quadratic model a step changes the deviance by half of slope · step.
         prior_curvature = 2 * prior_information(np.exp(here.log_variances), mixed.further)
         step = _scoring_step(here.curvature, here.slope, here.prior_slope, prior_curvature)
         gain = -0.5 * float(here.slope @ step)
@@ -544,13 +591,19 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihoo
 
 
 def _scoring_step(curvature: Array, slope: Array, prior_slope: Array, prior_curvature: Array) -> Array:
-    """Return a step (c,) in the log variances.
+    """Return a scoring step (c,) in the log variances, at most `_LEAP` in one.
 
-    In the variances themselves scoring is exact where one of them decides. One of which little would be left and that
-    is hardly known, or that would be negative, is hardly seen: there the likelihood curves, in the logarithm, by its
-    slope.
+    First a Newton step in the variances themselves, where scoring is exact if a single one decides. If it would make
+    one negative, or take nearly all of one that is hardly known, that variance is small against the data. Then a step
+    in the logarithms: there the likelihood of a small variance curves as much as it slopes.
+
+    Args:
+        curvature: (c, c) of the deviance in the log variances, without the prior's.
+        slope: (c,) of the deviance in the log variances, with the prior's.
+        prior_slope, prior_curvature: (c,) of −2 log prior in the log variances.
     """
-    # In the variance itself a prior curves by its slope in the logarithm as well.
+    # Second derivatives in the variance, times its square, are those in the logarithm less the slope there. Of the prior
+    # the larger of both counts, so that the step goes downhill.
     whole = curvature + np.diag(np.maximum(prior_curvature - prior_slope, prior_curvature))
     share = -np.linalg.solve(whole, slope)
     if (share > np.where(np.diag(whole) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
@@ -561,5 +614,5 @@ def _scoring_step(curvature: Array, slope: Array, prior_slope: Array, prior_curv
 
 
 def whitener(mixed: MixedModel, variances: Array) -> Array:
-    """Return the inverse Cholesky factors (B, m, m) of the blocks' covariance."""
+    """Return L⁻¹ (B, m, m) with cov z = L Lᵀ per block, at variances (c,): L⁻¹z has unit covariance."""
     return invert_covariance(mixed.covariance(variances)).half

@@ -10,9 +10,11 @@ MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
 
 
 def length_text(value: float, length_unit: str, digits: int = 3, zeros: bool = False) -> str:
-    """A length for people: 38.1 µm, 1.49 mm; a dash where nothing was measured.
+    """Return a length as text in µm, from 1000 µm on in mm: 38.1 µm, 1.49 mm; a dash where it is not finite.
 
     Args:
+        value: in `length_unit`, a key of METRES.
+        digits: significant ones.
         zeros: keep those at the end, as in columns of tables.
     """
     if not np.isfinite(value):
@@ -52,7 +54,7 @@ def duration_text(seconds: float) -> str:
 
 
 def value_uncertainty_text(value: float, U: float) -> str:
-    """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
+    """Return a value to the two digits of its expanded uncertainty, and that: 1451.82 ± 0.14; a dash if unknown."""
     if not np.isfinite(U) or U <= 0:
         return f"{_plain_decimal(value, 6)} ± –"
     text = uncertainty_text(U)
@@ -65,7 +67,11 @@ def uncertainty_text(U: float) -> str:
 
 
 def _plain_decimal(value: float, digits: int, zeros: bool = False) -> str:
-    """So many digits that count, more where there are more before the point; never an exponent."""
+    """Return a number with so many significant digits, and all digits before the point; never an exponent.
+
+    Args:
+        zeros: keep those at the end.
+    """
     digits = max(digits, len(str(int(abs(value)))))
     keep = zeros and value != 0
     text = np.format_float_positional(
@@ -75,7 +81,7 @@ def _plain_decimal(value: float, digits: int, zeros: bool = False) -> str:
 
 
 def rounded(value: float, sigma: float) -> str:
-    """A value to the first digit of its sigma; four digits where nothing is known of it."""
+    """Return a value rounded to the place of the first digit of its sigma; four digits where sigma is not known."""
     if not np.isfinite(sigma) or sigma <= 0:
         return f"{value:.4g}"
     place = int(np.floor(np.log10(sigma)))
@@ -84,7 +90,10 @@ def rounded(value: float, sigma: float) -> str:
 
 
 def display_unit(unit: str) -> tuple[float, str]:
-    """Factor and unit in which numbers are read: mrad, µrad per something, ppm of growth, mm for m."""
+    """Return the factor to, and the name of, the unit in which a parameter is shown: ("rad/°C") → (1e6, "µrad/°C").
+
+    mrad for rad, ppm for shares per °C or hour, mm for m; any other unit stays.
+    """
     if unit.startswith("rad/"):
         return 1e6, f"µ{unit}"
     if unit in ("1/°C", "1/h"):
@@ -109,11 +118,11 @@ class Amount(NamedTuple):
 
 
 def format_amount(value: float, sigma: float | None, unit: str) -> Amount:
-    """A value to the first digit of its sigma, angles in mrad, angles per something in µrad: 0.63 ± 0.04 µrad/(N m);
-    growth in millionths: 11.5 ± 0.3 ppm/°C.
+    """Return a parameter as people read it, in the unit of `display_unit`: 0.63 ± 0.04 µrad/(N m), 11.5 ± 0.3 ppm/°C.
 
     Args:
-        unit: that of value and sigma, with angles in rad.
+        sigma: standard deviation; None, NaN or 0: not known.
+        unit: of value and sigma, with angles in rad.
     """
     factor, shown_unit = display_unit(unit)
     known = sigma is not None and np.isfinite(sigma) and sigma > 0

@@ -61,13 +61,17 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Satterthwaite:
-    """The components in units of the scatter, and how well their variances are known."""
+    """Components of a covariance V = L Lᵀ, whitened, and how well their variances λ are known."""
 
-    white: Array  # (c, B, m, m)
+    white: Array  # (c, B, m, m) λ_i L⁻¹C_iL⁻ᵀ: they sum to 1
     spread: Array  # (c, c) covariance of the log variances
 
     def degrees_of_freedom(self, white: Array) -> float:
-        """Degrees of freedom of the scatter along whitened columns (B, m, p), on average over them."""
+        """Return Satterthwaite's degrees of freedom of the scatter in the space of whitened columns (B, m, p).
+
+        2/ν = Σ_ij s_i s_j spread_ij, with s_i the share of component i in the variance, averaged over the space; ν is
+        at most `_MANY`.
+        """
         directions = column_space(white.reshape(-1, white.shape[2])).reshape(*white.shape[:2], -1)
         if not directions.shape[2]:
             return _MANY
@@ -76,7 +80,10 @@ class Satterthwaite:
         return float(min(2 / max(shares @ self.spread @ shares, 2 / _MANY), _MANY))
 
     def of_each(self, white: Array) -> Array:
-        """Return the degrees of freedom (p,) of the scatter along each whitened column (B, m, p) by itself."""
+        """Return Satterthwaite's degrees of freedom (p,) of the scatter along each whitened column (B, m, p) alone.
+
+        As `degrees_of_freedom`; `_MANY` for a column of zeros.
+        """
         squares = np.sum(white**2, axis=(0, 1))
         shares = np.einsum("bmp,cbmp->cp", white, self.white @ white) / np.maximum(squares, 1e-300)
         known = 2 / np.maximum(np.sum(shares * (self.spread @ shares), axis=0), 2 / _MANY)
@@ -84,10 +91,12 @@ class Satterthwaite:
 
 
 def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
-    """Return how well the variances of a fit are known, from the expected information of REML.
+    """Return how well the variances of a fit are known, from REML's expected information and the prior's.
+
+    With whitened components K_i it is ½ tr(M K_i M K_j), where M = 1 − UUᵀ projects out the mean's columns.
 
     Args:
-        null: the fit without the columns whose degrees of freedom are asked for.
+        null: the fit without the columns whose degrees of freedom will be computed.
     """
     half = whitener(mixed, null.variances)
     white = null.variances[:, None, None, None] * (half @ mixed.components @ half.transpose(0, 2, 1))
@@ -95,7 +104,7 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     U = column_space(mean.reshape(-1, mean.shape[2])).reshape(*mean.shape[:2], -1)
     KU = white @ U
     within = np.einsum("bik,cbil->ckl", U, KU, optimize=True)
-    # tr(M K_i M K_j) with M = 1 − UUᵀ.
+    # ½ tr(M K_i M K_j), multiplied out: no product of whole blocks.
     information = 0.5 * (
         np.einsum("cbij,dbij->cd", white, white, optimize=True)
         - 2 * np.einsum("cbik,dbik->cd", KU, KU, optimize=True)
@@ -108,18 +117,25 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
 
 @dataclass(frozen=True)
 class _MeanFreeData:
-    """Numbers without their mean: n of them, the components of their covariance and square roots of these."""
+    """Observations projected on the n directions in which the mean's columns are zero, as one block."""
 
     z: Array  # (n,)
-    components: Array  # (c, n, n)
-    roots: list[Array]  # per component (n, rank)
-    fixed: Array  # (n, n)
+    components: Array  # (c, n, n) of the covariance
+    roots: list[Array]  # per component a square root (n, rank); rank 0: the component is zero
+    fixed: Array  # (n, n) covariance that is known, added to the components
 
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
-    """(c,) posterior means of the variances, begun at their maximum.
+    """Return posterior means (c,) of the variances, by Gibbs sampling on a grid of each, from their maximum on.
 
-    Among so many numbers that a round takes seconds, and where the mean explains all of them, the maximum itself.
+    In each round every variance is drawn given the others, and its conditional mean is what is averaged. Then the
+    common factor on usual sizes is drawn. The first rounds are not counted.
+
+    The maximum itself is returned from `_NO_ROUNDS` observations on, where a round takes seconds, and where the mean
+    leaves no observation over.
+
+    Args:
+        fit: the maximum of the restricted likelihood.
     """
     if mixed.size >= _NO_ROUNDS:
         return fit.variances
@@ -152,9 +168,10 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
 
 
 def _densities(mixed: MixedModel, grids: Sequence[Array], shared: Mask) -> list[Array]:
-    """Return per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual.
+    """Return the log prior density of each variance on its grid: (1, g), or (F, g) for all F factors of `_FACTORS`.
 
     Args:
+        grids: per component, variances (g,).
         shared: (c,) components that share a factor on their usual sizes.
     """
     out = []
@@ -165,7 +182,10 @@ def _densities(mixed: MixedModel, grids: Sequence[Array], shared: Mask) -> list[
 
 
 def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
-    """All numbers as one block, turned to where the mean's columns are nothing: their likelihood is the restricted."""
+    """Return the observations projected on the complement of the mean's columns: their likelihood is the restricted.
+
+    All blocks are joined into one.
+    """
     free = np.linalg.svd(column_space(flatten_blocks(mixed.A)), full_matrices=True)
     turn = free[0][:, free[1].size :].T
     roots = []
@@ -180,12 +200,12 @@ def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
 
 
 def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
-    """Return by component the grid of variances over which is integrated, in equal steps of their logarithms.
+    """Return per component the grid (g,) of variances that it is drawn from, in equal steps of the logarithm.
 
-    The first one of a component that may be absent stands for all below.
+    Each spans `_BELOW` to `_ABOVE` about a usual variance; the first value stands for all smaller ones.
 
     Args:
-        likeliest: (c,) variances.
+        likeliest: (c,) variances at the maximum; that of the noise centres its grid.
     """
     usual = 1e-4 * usual_variances(mixed.z, mixed.components)
     usual[NOISE] = likeliest[NOISE]
@@ -196,9 +216,14 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
 
 
 def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, density: Array) -> Array:
-    """(g,) probabilities of the values of variance i while the others stand.
+    """Return the posterior probabilities (g,) of the values of variance i on its grid, given the other variances.
 
     V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
+
+    Args:
+        current: (c,) variances now.
+        grid: (g,) values of variance i.
+        density: (g,) its log prior there.
 
     Raises:
         LinAlgError: the covariance is not positive.
