@@ -602,8 +602,8 @@ def _scoring_step(curvature: Array, slope: Array, prior_slope: Array, prior_curv
         slope: (c,) of the deviance in the log variances, with the prior's.
         prior_slope, prior_curvature: (c,) of −2 log prior in the log variances.
     """
-    # Second derivatives in the variance, times its square, are those in the logarithm less the slope there. Of the prior
-    # the larger of both counts, so that the step goes downhill.
+    # Second derivatives in the variance, times its square, are those in the logarithm less the slope there. Of the
+    # prior's the larger of both counts, so that the step goes downhill.
     whole = curvature + np.diag(np.maximum(prior_curvature - prior_slope, prior_curvature))
     share = -np.linalg.solve(whole, slope)
     if (share > np.where(np.diag(whole) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
