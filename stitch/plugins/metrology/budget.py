@@ -90,6 +90,7 @@ class MeasuredFeatures(Table, document="stitch.plugins.metrology.documents:measu
     fits: tuple[FittedFeature, ...]  # of all features but distances
     length_unit: str
     not_measured: dict[str, str] = field(default_factory=dict)  # features without numbers, and why
+    T_datum_reference: Array | None = None  # (4, 4) from the run's reference frame into that of its datum
     checked: "MonteCarlo | None" = None  # trials that were drawn of all sources
 
     @property
@@ -139,6 +140,8 @@ def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[tuple[
 def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature]) -> MeasuredFeatures:
     """Return the numbers of fits and of distances between them, under all that may be wrong about the places."""
     quantities, values, nominal, slopes = number_table(wanted.features, fits)
+    aligned = free_of_datum(slopes, fits, places.centre, datum_rows(quantities, wanted.datum))
+    slopes = aligned @ slopes
     counted = replace(places, sources=_not_stated(places, wanted))
     of_fits, noise = zip(*(counted.loadings(fit.at, fit.gradient) for fit in fits), strict=True)
     variances, vectors = np.linalg.eigh(slopes @ block_diag(*noise) @ slopes.T)
@@ -146,7 +149,7 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     of_sources = np.split(slopes @ np.vstack(of_fits), ends, axis=1)
     rows = [(s.name, loadings, s.degrees) for s, loadings in zip(counted.sources, of_sources, strict=True)]
     rows.append((OWN_NOISE, vectors * np.sqrt(np.maximum(variances, 0.0)), np.inf))
-    rows += [(c.source, _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
+    rows += [(c.source, aligned @ _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
     covariance = np.sum([loadings @ loadings.T for _, loadings, _ in rows], axis=0)
     by_fit = {fit.feature.name: fit for fit in fits}
     length_unit = places.measurement.length_unit
@@ -256,6 +259,34 @@ def distance_between(a: Feature, of_a: Array, b: Feature, of_b: Array) -> Array:
     return np.abs(z - h - su * x - sv * y) / np.sqrt(1 + su**2 + sv**2)
 
 
+def datum_rows(quantities: Sequence[tuple[Feature, str]], datum: Sequence[str]) -> list[int]:
+    """Return where the numbers of a datum stand among all."""
+    names = [f"{feature.name}.{quantity}" for feature, quantity in quantities]
+    return [names.index(number) for number in datum]
+
+
+def free_of_datum(slopes: Array, fits: Sequence[FittedFeature], centre: Array, rows: Sequence[int]) -> Array:
+    """Return what is left (Q, Q) of changes of numbers where six of them, the rows of a datum, stay nominal.
+
+    The part is moved back by what the six change: 1 − M·M_d⁻¹·P_d, with the answers M (Q, 6) to a motion.
+    """
+    left = np.eye(len(slopes))
+    if rows:
+        motions = answers_to_motion(slopes, fits, centre)
+        left[:, rows] -= motions @ np.linalg.inv(motions[rows])
+        left[rows] = 0.0
+    return left
+
+
+def answers_to_motion(slopes: Array, fits: Sequence[FittedFeature], centre: Array) -> Array:
+    """Return the change (Q, 6) of numbers with a motion of the part about a centre (3,): turn in rad, then shift."""
+    of_fits = [
+        np.hstack([np.cross(fit.at.points - centre, fit.gradient).sum(axis=1), fit.gradient.sum(axis=1)])
+        for fit in fits
+    ]
+    return slopes @ np.vstack(of_fits)
+
+
 def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, Array]:
     """The distance of two fits, and its slopes in the numbers of either."""
     if a.feature.kind == "plane" and b.feature.kind != "plane":
@@ -296,7 +327,8 @@ def monte_carlo(
     linear = evaluate(places, wanted, thin)
     modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in _not_stated(places, wanted)]
     by_feature = {fit.feature.name: (fit.feature, _refits(places, fit, modes, trials, rng)) for fit in thin}
-    quantities, values, _, _ = number_table(wanted.features, thin)
+    quantities, values, _, slopes = number_table(wanted.features, thin)
+    aligned = free_of_datum(slopes, thin, places.centre, datum_rows(quantities, wanted.datum))
     columns = list[Array]()
     for feature in wanted.features:
         if feature.kind == "distance":
@@ -309,6 +341,7 @@ def monte_carlo(
         loadings = _stated_loadings(stated, quantities, values)
         drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
     kept = measured_rows(quantities)
+    drawn = drawn @ aligned.T
     return MonteCarlo(trials, drawn[:, kept].std(axis=0, ddof=1) / [max(n.u, 1e-300) for n in linear.numbers])
 
 

@@ -24,6 +24,7 @@ def measure_document(measured: MeasuredFeatures, run: str = "") -> dict[str, Any
         "k": COVERAGE_FACTOR,
         "numbers": [_number(n, ratio) for n, ratio in zip(measured.numbers, ratios, strict=True)],
         "covariance": {"numbers": [n.name for n in measured.numbers], "matrix": measured.covariance.tolist()},
+        "T_datum_reference": None if (T := measured.T_datum_reference) is None else T.tolist(),
         "trials": None if trials is None else trials.trials,
         "not_measured": measured.not_measured,
         "not_included": list(NOT_INCLUDED),

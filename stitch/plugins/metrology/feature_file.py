@@ -19,6 +19,7 @@ from stitch.session.reading.text_files import read_toml, reason_of, shortened
 # Points count within so many spacings of the nominal surface, and a patch is so wide, where nobody says so.
 _WITHIN = 10.0
 _PATCH = 15.0
+_TOP = ("length_unit", "frame", "datum", "cad", "feature", "contribution", "limits")
 _COMMON = ("name", "kind", "tolerance", "calibrated", "U")
 _KEYS = {
     "point": ("at", "normal", "radius", "within"),
@@ -29,6 +30,8 @@ _KEYS = {
     "circle": ("at", "axis", "diameter", "within"),
     "distance": ("between", "nominal"),
 }
+# A part moves in six directions.
+_DATUM = 6
 _PLACED = {kind for kind in NUMBERS if kind != "distance"}
 
 
@@ -49,6 +52,7 @@ class FeatureList:
     features: tuple[Feature, ...]
     contributions: tuple[Contribution, ...] = ()
     limits: dict[str, float] | None = None  # largest permissible errors of a verification: form, size, distance, place
+    datum: tuple[str, ...] = ()  # six numbers that are nominal in the part's frame; empty: the run's reference frame
 
 
 def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
@@ -62,7 +66,7 @@ def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
         InputError: the file is missing or malformed, a key is unknown, or a feature lacks what it needs.
     """
     document = read_toml(file, "write one with a [[feature]] for each thing to measure: see docs/measure.md")
-    require_known_keys(str(file), document, ("length_unit", "frame", "cad", "feature", "contribution", "limits"))
+    require_known_keys(str(file), document, _TOP)
     unit = document.get("length_unit", length_unit)
     if unit not in METRES:
         raise InputError(f"{file}: length_unit is {shortened(unit)}; to fix: write {' or '.join(METRES)}")
@@ -82,7 +86,7 @@ def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
                 "spheres, cylinders or circles of this file"
             )
     contributions = tuple(reader.contribution(i, row) for i, row in enumerate(document.get("contribution", [])))
-    return FeatureList(features, contributions, reader.limits())
+    return FeatureList(features, contributions, reader.limits(), reader.datum(features))
 
 
 def feature_list(
@@ -228,6 +232,19 @@ class _Reader:
         return Contribution(
             row["source"], numbers.get("relative", 0.0), self.scale * numbers.get("length", 0.0), degrees
         )
+
+    def datum(self, features: Sequence[Feature]) -> tuple[str, ...]:
+        """Return the six numbers that the part is aligned by; none where the file asks for no alignment."""
+        if "datum" not in self.document:
+            return ()
+        numbers = self.document["datum"]
+        known = {f"{f.name}.{quantity}" for f in features if f.kind in _PLACED for quantity in NUMBERS[f.kind]}
+        if not isinstance(numbers, list) or not len(numbers) == len(known.intersection(map(str, numbers))) == _DATUM:
+            raise InputError(
+                f"{self.file}: datum is {shortened(numbers)}; to fix: name six numbers of points, planes, spheres, "
+                'cylinders or circles, as "face.offset" or "ball 1.x"'
+            )
+        return tuple(numbers)
 
     def limits(self) -> dict[str, float] | None:
         """Return the largest permissible errors of a verification."""

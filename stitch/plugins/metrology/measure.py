@@ -105,6 +105,8 @@ def _show_numbers(measured: MeasuredFeatures) -> None:
         (n.name, f"{n.value:.5g}", f"{n.value - n.nominal:.2g}", f"{n.U:.2g}", _budget_text(n))
         for n in measured.numbers
     ]
+    if measured.T_datum_reference is not None:
+        say("Numbers count in the frame of the datum, T_datum_reference in features.json.")
     show_table(title, ("number", "value", "off nominal", "U", "most of U"), rows, words=("number", "most of U"))
     if (checked := measured.checked) is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())

@@ -19,6 +19,7 @@ from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, 
 from stitch.plugins.metrology.calibrate.robot import calibrated_robot_of_run, link_table, robot_document
 from stitch.plugins.metrology.calibrate.sphere import calibrate_sphere, sphere_document
 from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, tracker_document
+from stitch.plugins.metrology.datum import into_datum
 from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList, feature_list
 from stitch.plugins.metrology.features import Feature
@@ -72,8 +73,8 @@ def measure(
         ('middle.deviation', True)
     """
     wanted = feature_list(features, run.session.length_unit, run.measurement.capture.spacing)
-    places = place_errors(run)
-    measured = measure_features(places, wanted)
+    places, T = into_datum(place_errors(run), wanted)
+    measured = replace(measure_features(places, wanted), T_datum_reference=T)
     if not trials:
         return measured
     seen = replace(wanted, features=tuple(f for f in wanted.features if f.name not in measured.not_measured))
@@ -134,6 +135,8 @@ def judge_artefact(
             fix_cli="write calibrated = … and U = … of some",
             fix_python="state calibrated and calibrated_U of some",
         )
+    if wanted.datum:
+        raise InputError(f"{session.name}: an artefact is judged as it lies; to fix: leave out its datum")
     measured = measure_features(place_errors(state), wanted)
     assert state.hand_eye_transfer is not None
     return judge(measured, wanted.limits, state.hand_eye_transfer), state
