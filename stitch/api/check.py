@@ -55,7 +55,11 @@ def check(session: SessionData | Path | str, *, deep: bool = True) -> CheckedSes
 
 
 def session_summary(session: SessionData) -> dict[str, Any]:
-    """Return what a session holds, in plain numbers."""
+    """Return the contents of a session as `stitch check --json` prints them.
+
+    `median_range` is the median over the views of the median distance of their points from the sensor, length_unit.
+    It is None without points. Labelled points stand in for it where there are no clouds.
+    """
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     sighted = [view.sighting.points for view in session.views if view.sighting is not None]
     ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds or sighted]

@@ -192,10 +192,17 @@ class LiveSession:
             return self._take(self._with_axes(replace(one.views[0], approach=None)), began)
 
     def _with_axes(self, view: View) -> View:
-        """Return a view with the effective pose that its readings of the external axes make of the reported one."""
+        """Return a view whose pose takes in its readings of the external axes; without axes, the view as it is.
+
+        `place_axes` multiplies the reported T_base_flange by the motion of the axes at these readings.
+
+        Raises:
+            InputError: the view's covariates hold no reading of an axis.
+        """
         cell = self.session
         if not cell.axes:
             return view
+        # An axis may be read in one of several units, each a column of its own.
         for axis in cell.axes:
             if not set(axis.columns(cell.length_unit)) & set(view.covariates):
                 column = " or ".join(axis.columns(cell.length_unit))
@@ -224,6 +231,7 @@ class LiveSession:
             began: `time.perf_counter` at the call, from which the seconds count.
         """
         with self._lock:
+            # The values themselves are never changed in place, so that holding them is enough to go back.
             before = (self.session, self._fit, self._members, self._drawn)
             count = len(self.said)
             try:
@@ -250,8 +258,8 @@ class LiveSession:
     def next_pose(self) -> ProposedPose | None:
         """Return the pose, near those taken, that would lower U of the hand-eye most; None before there is one.
 
-        Poses are those of the views, turned about the middle of what they see by 15 to 45°. Every view counts as much
-        as the ones before did on average.
+        The candidates are the poses of the views, turned about the middle of what they see by 15 to 45°. The new view
+        is assumed to show its pose as precisely as the others do on average.
 
         Example:
             >>> proposed = live.next_pose()
@@ -282,7 +290,13 @@ class LiveSession:
         return run(self.session, recorder=recorder, **options)
 
     def _after_last(self, view: View) -> View:
-        """Add the view to the session."""
+        """Append a view to the session, and return it with its direction of approach filled in.
+
+        The approach of each joint is the sign (n,) of its travel from the view before; 0 in the first view.
+
+        Raises:
+            InputError: the view has no scan, or its time lies before that of the view before.
+        """
         if view.cloud is None:
             raise InputError(f"view {view.name}: no scan; to fix: pass one, or leave the view out")
         before = self.session.views[-1] if self.session.views else None
@@ -295,11 +309,11 @@ class LiveSession:
         return view
 
     def _judge(self, view: View) -> LiveView:
-        """Return what is said of the last view of the session, and put it into the fit if it belongs.
+        """Return the verdict on `view`, the last view of the session, and add it to the fit if it belongs.
 
-        A copy is asked for first, since a scan that is there twice fits itself. Then the view is placed by its surface,
-        and all views are tested with it: others may turn out not to belong, and leave the fit. Last, what U gains says
-        if it adds much.
+        First it is compared with earlier scans, since a copy would fit its original perfectly. Then its surface places
+        it among the others, and all views are tested again: older ones may turn out to be wrong and leave the fit.
+        Last, the fall of the hand-eye's U (k = 2) tells whether the view adds anything.
         """
         original = self._original_of(view)
         if original is not None:
@@ -319,12 +333,14 @@ class LiveSession:
             return self._rejected(
                 view, "It shares no surface with the others: its pose is far off, or it shows another part."
             )
+        # Position in `members` is the view's index in the fit; its value is the index in the session.
         members = [*self._members, len(self.session.views) - 1]
         blunders = self._blunders(fit, members)
         if len(members) - 1 in blunders:
             return self._rejected(view, blunders[len(members) - 1])
         self._members = members
         self._fit = fit
+        # From the last on, so that the indices of those before stay valid.
         for v in sorted(blunders, reverse=True):
             self._fit = without_view(self._fit, v)
             self._members = self._members[:v] + self._members[v + 1 :]
@@ -336,7 +352,7 @@ class LiveSession:
         return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
     def _original_of(self, view: View) -> View | None:
-        """Return the view before, of which this one has the same scan to the last digit."""
+        """Return the first earlier view whose scan has exactly the same points; None where there is none."""
         assert view.cloud is not None
         clouds = [before.cloud for before in self.session.views[:-1]]
         same = (i for i, cloud in enumerate(clouds) if cloud and np.array_equal(cloud.points, view.cloud.points))
@@ -344,7 +360,12 @@ class LiveSession:
         return None if first is None else self.session.views[first]
 
     def _first_fit(self, view: View) -> LiveView:
-        """Fit the views so far, if they are enough; copies do not count."""
+        """Try the first fit of the hand-eye from the views so far, and return the verdict on the last one, `view`.
+
+        "waiting" means no fit yet: too few views, two hand-eyes that fit equally well, or no solution. Otherwise the
+        fit is begun with the views that screening leaves in.
+        """
+        # Before there is a fit, every verdict but "waiting" is that of a copied scan.
         copies = [i for i, said in enumerate(self.said) if said.verdict != "waiting"]
         whole = [i for i in range(len(self.session.views)) if i not in copies]
         session = self._session_of(whole)
@@ -374,7 +395,14 @@ class LiveSession:
         return self._report(view, "fits", f"The first hand-eye.{f' {left_out}.' if left_out else ''}")
 
     def _blunders(self, fit: LiveFit, members: list[int]) -> dict[int, str]:
-        """Return the views of a fit that contradict the others beyond what usual effects of an arm do, and why."""
+        """Return the views of a fit that contradict the others, as sentences by index in the fit.
+
+        They are searched twice: without effects of the arm, and with usual sizes of these as further errors. Only views
+        found both times count, since an ordinary arm error is no wrong pose.
+
+        Args:
+            members: by index in the fit, the index of each view in the session.
+        """
         model = view_model(fit.capture, fit.T_mount, fit.unconstrained)
         search = find_blunders(model)
         if not search.blunders:
@@ -389,7 +417,16 @@ class LiveSession:
     def _displacement(
         self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]
     ) -> str | None:
-        """Say how far off a view is at least; None where its evidence admits that it is not."""
+        """Return a sentence on the least error of a view's pose that agrees with the scans; None where that may be 0.
+
+        The error is a rotation (rad) and the shift of the middle of the view's points (length_unit).
+
+        Args:
+            model: linear model of the views' pose errors.
+            search: result of the search for wrong poses in `model`, with the scatter of the poses.
+            view: index of the view in the fit.
+            others: indices of the other views whose poses are wrong; they are left free.
+        """
         middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
         rotation, shift = least_displacement(model, search, others, (), view, middle)
         if shift == 0 and rotation <= _SMALLEST_TURN:
@@ -398,7 +435,11 @@ class LiveSession:
         return f"Its pose is off by at least {length_text(shift, self.session.length_unit)}{turn}."
 
     def _rejected(self, view: View, why: str) -> LiveView:
-        """Leave the view out of the fit; several in a row have one cause."""
+        """Return the verdict "does_not_belong" for a view; the fit stays without it.
+
+        From `_IN_A_ROW` rejected views in a row on, the sentence `why` also names their probable common cause.
+        """
+        # Rejected views at the end of `said`, and this one.
         row = 1
         while row <= len(self.said) and self.said[-row].verdict == "does_not_belong":
             row += 1
@@ -416,24 +457,36 @@ class LiveSession:
     def _errors(
         self, capture: Capture, freed: UnconstrainedPoses, T_mount: Array
     ) -> tuple[PoseErrors, dict[str, list[Array]]]:
-        """Return usual errors of poses and of scanners for the views in the fit.
+        """Return errors of usual size, of the poses and of the scanner, for the covariance of the live fit.
 
         Args:
-            T_mount: (4, 4) hand-eye so far.
+            capture: the views in the fit.
+            freed: poses of these views by their overlaps alone, without the robot.
+            T_mount: (4, 4) hand-eye so far, scanner to mount, length_unit.
+
+        Returns:
+            Errors of poses; and by source of the scanner's errors, (6V, K) twists that the views show for one sigma of
+            each of K errors.
         """
         measurement = measurement_of(self._session_of(self._members), capture)
         errors = prior_pose_errors([measurement], Model(T_mount), [freed.overlaps.gram.centre])
         return errors, rig_scanner_errors([measurement], [freed])
 
     def _show(self, recording: LiveRecording) -> None:
-        """Show the last view; with the first hand-eye all before it once more, in their places."""
+        """Show the last view in a recording; the first hand-eye gives places, so that all views are shown again."""
         first = self._drawn if self._fit is not None else len(self.said) - 1
         for i in range(first, len(self.said)):
             recording.view(self.session.views[i], self._pose_of(i), self.said[i])
         self._drawn = len(self.said) if self._fit is not None else 0
 
     def _pose_of(self, index: int) -> Array | None:
-        """Return T_reference_scanner (4, 4) of a view by the surfaces, or by the robot where it does not belong."""
+        """Return T_reference_scanner (4, 4) of a view, length_unit; None before there is a fit.
+
+        A view in the fit stands where its overlaps put it; one that does not belong, where robot and hand-eye do.
+
+        Args:
+            index: of the view in the session.
+        """
         if self._fit is None:
             return None
         if index in self._members:
@@ -508,7 +561,10 @@ def _recording(session: Session, target: str) -> LiveRecording:
 
 
 def _as_reported(proposed: ProposedPose, session: SessionData) -> ProposedPose:
-    """Return the pose as the arm is sent there, its external axes as at the view from which it is turned."""
+    """Return a proposed pose in the frame that the robot reports, its external axes as at the view it is turned from.
+
+    The fit works with T_base_flange that includes the motion of the axes; `carried` is that motion, undone here.
+    """
     if not session.axes:
         return proposed
     like = next(view for view in session.views if view.name == proposed.like)
@@ -517,9 +573,10 @@ def _as_reported(proposed: ProposedPose, session: SessionData) -> ProposedPose:
 
 
 def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) -> ProposedPose:
-    """Return the pose that would reduce the hand-eye's U most, of all poses taken, each turned about the part.
+    """Return the pose that would reduce the hand-eye's U most, among all poses taken, each turned about the part.
 
-    Every view is taken to show its pose alike well, so that poses alone say by which factor U changes.
+    Each view v measures its pose with the same unit precision; J_v is that pose's derivative by the hand-eye. With
+    J̄ the mean over the views, the information is Σ (J_v − J̄)ᵀ (J_v − J̄). Only the ratio of two U is used.
 
     Args:
         live_fit: the views in the fit and their hand-eye.
@@ -534,17 +591,23 @@ def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) ->
     turned = np.array([[T @ T_mount for T in about_part] for T_mount in capture.T_reference_mount])
     poses = turned.reshape(-1, 4, 4)
     to_centre = frames.make(np.eye(3), -gram.centre)
-    # (·, 6, 6) left twist of a view about the centre per right perturbation of the hand-eye.
+    # Both (·, 6, 6): left twist of a view about the centre per right twist of the hand-eye.
     jacobians_taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
     jacobians_proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
     # Rotations count as the displacements that they make at the lever.
     unit = np.array([gram.lever] * 3 + [1.0] * 3)[:, None]
 
     def relative_uncertainty(jacobians: Array) -> float:
-        """Return U at the part, up to a factor, from views (V, 6, 6); what moves all views alike shows nothing."""
-        apart = unit * (jacobians - jacobians.mean(axis=0))
-        information = np.einsum("vki,vkj->ij", apart, apart)
-        # What no view shows yet is far from known, not known without error.
+        """Return U of the hand-eye at the part, up to a common factor.
+
+        The mean is subtracted, since a motion of all views together leaves their overlaps unchanged.
+
+        Args:
+            jacobians: (V, 6, 6) left twist of each view about the part's centre per right twist of the hand-eye.
+        """
+        deviations = unit * (jacobians - jacobians.mean(axis=0))
+        information = np.einsum("vki,vkj->ij", deviations, deviations)
+        # A weak prior keeps the information invertible: a direction that no view shows yet gets a large variance.
         weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
         return displacement(np.linalg.inv(information + weak), hand_eye.middle)
 

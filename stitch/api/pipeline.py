@@ -97,8 +97,16 @@ def run_rig(
     """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run per session.
 
     Args:
-        captures: what `prepare_capture` makes of the sessions, where that has begun already.
+        sessions: of one mount and length unit; the runs come in their order.
+        model: hand-eye and effects of another run, used as they are instead of being fitted.
+        recorders: one a session, told of every stage; None: nobody is.
+        effects, keep, arm, register: as of `run`.
+        captures: what `prepare_capture` returns for each session, where that has begun already; None: it is made here.
+
+    Raises:
+        InputError, NoResultError: as of `run`, and sessions that cannot share a rig.
     """
+    # Refuses an unknown method before anything is computed.
     method_named(register)
     require_same_rig(sessions, model)
     if model:
@@ -117,12 +125,14 @@ def run_rig(
         hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
         measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
         seconds = clock.lap()
+        # Results of the coarse stage, one a session.
         coarse = []
         for session, measurement, hand_eye, recorder in zip(sessions, measurements, hand_eyes, recorders, strict=True):
             with refuse_explained_mistake(session):
                 coarse.append(_show_coarse_stage(session, measurement, hand_eye, seconds, recorder))
         start = FitStart(hand_eyes, _initial_model(sessions[0], effects, arm), given=model)
         with closing(_Conductor(sessions, start, coarse, recorders, register)) as conductor:
+            # Fits again whenever it leaves views out; the views are registered and fused meanwhile.
             screened = fit_screened_views(sessions, measurements, conductor.fit, keep)
             if model:
                 check = _check_given_hand_eye if sessions[0].has_clouds else _check_against_own_model
@@ -149,7 +159,13 @@ def join_scanners(
     arm: ModelFile | None = None,
     captures: Sequence[Future[Capture]] | None = None,
 ) -> SessionData:
-    """Return sessions of several scanners in one cell as one, each scanner where its own views put it, or a model.
+    """Return the sessions of several scanners in one cell joined into one, each scanner with a starting hand-eye.
+
+    A scanner's `T_mount` is that of `model` if given, else a fit of its own views alone, else the one it states.
+
+    Args:
+        arm: effects of joints and links that stay as they are in these fits.
+        captures: what `prepare_capture` returns for each session, where that has begun already.
 
     Raises:
         InputError: they share no arm, no unit, no axes or no mount; or a model of other scanners.
@@ -178,8 +194,17 @@ def join_scanners(
 def _measured(
     sessions: Sequence[SessionData], captures: Sequence[Future[Capture]] | None, effects: Sequence[str] = ()
 ) -> tuple[Sequence[SessionData], Sequence[Measurement]]:
-    """Return sessions whose external axes are located, and what was measured in them; effects that they cannot have are
-    refused."""
+    """Return the sessions with their external axes located by the scans, and the measurement of each.
+
+    Without axes the sessions come back as they are.
+
+    Args:
+        captures: what `prepare_capture` returns for each session, where that has begun already; None: it is made here.
+        effects: names of effects that are to be fitted or used.
+
+    Raises:
+        InputError: a session cannot have one of these effects.
+    """
     prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
     measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
     require_effects(measurements, effects)
@@ -187,7 +212,11 @@ def _measured(
 
 
 def _fit_alone(session: SessionData, measurement: Measurement, arm: ModelFile | None) -> Correction:
-    """Return what the views of one scanner say by themselves."""
+    """Return the hand-eye of one session corrected from its own views, the effects of `arm` staying as they are.
+
+    Raises:
+        NoResultError: the views give no hand-eye, or do not overlap.
+    """
     hand_eyes = pipeline_for(session).start([session], [measurement], None)
     measurement = with_part_origin(measurement, hand_eyes[0].T_mount)
     correction = _fit_unseen([session], [measurement], hand_eyes, (), arm).correction
@@ -202,13 +231,23 @@ def _fit_unseen(
     effects: Sequence[str],
     arm: ModelFile | None,
 ) -> FittedRig:
-    """Return sessions fitted beside the run, which no recorder is told of."""
+    """Return a further fit of sessions, for comparison with that of the run; no recorder shows it.
+
+    Args:
+        hand_eyes: where the fit begins, one a session.
+        effects: names of effects that are fitted with the hand-eye.
+        arm: effects of joints and links that stay as they are.
+    """
     start = FitStart(hand_eyes, _initial_model(sessions[0], effects, arm))
     return pipeline_for(sessions[0]).fit(sessions, measurements, start, SilentRecorder())
 
 
 def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlone, ...]:
-    """Return the hand-eyes of several scanners, each by those of its own views that count; none of one scanner."""
+    """Return the hand-eye of each scanner, fitted from its own views alone; empty for a session of one scanner.
+
+    A scanner whose views give no hand-eye is left out. `session` joins the sessions `parts`, one a scanner k, after
+    screening; only the views that it still has are used. It names them VIEW@SCANNER.
+    """
     found = []
     for k, whole in enumerate(session.parts):
         name = whole.scanner.name
@@ -223,7 +262,9 @@ def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlo
 
 
 def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
-    """Refuse sessions that cannot share a hand-eye, whose times fall, or that show nothing.
+    """Refuse sessions that cannot share a rig: its mount, length unit, model, kind of data, and external axes.
+
+    Each session by itself also needs something measured, two views, and times that never decrease.
 
     Raises:
         InputError: names the session and what is wrong.
@@ -266,7 +307,11 @@ def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -
 
 
 def _require_same_arm(first: SessionData, other: SessionData) -> None:
-    """Sessions of labelled points share an arm; its loads may differ."""
+    """Refuse two sessions whose robots differ in their kinematics; masses may differ, and one may state no robot.
+
+    Raises:
+        InputError: another number of joints, or other transforms before, after or zero angles of them.
+    """
     a, b = first.robot, other.robot
     if a is None or b is None:
         return
@@ -289,6 +334,7 @@ def require_measured_once(sessions: Sequence[SessionData]) -> None:
     Raises:
         InputError: names both sessions and views.
     """
+    # Session and view by the bytes of the scan's first points. Within one session a repeated scan is not refused here.
     known: dict[bytes, tuple[SessionData, str]] = {}
     for session in sessions:
         clouds = {
@@ -315,6 +361,7 @@ def require_effects(measurements: Sequence[Measurement], effects: Sequence[str])
     for effect in map(find_effect, effects):
         for measurement in measurements:
             require_available(measurement, effect)
+        # One value of each parameter is fitted to all sessions.
         parameters = [{f"{p.name} ({p.unit})" for p in parameters_in(m, effect)} for m in measurements]
         for measurement, names in zip(measurements, parameters, strict=True):
             if names != parameters[0]:
@@ -328,16 +375,29 @@ def require_effects(measurements: Sequence[Measurement], effects: Sequence[str])
 def _show_coarse_stage(
     session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
 ) -> StageResult:
-    """Return the stage of the coarse hand-eye, which took so many seconds, after showing it to a recorder."""
+    """Return the result of the coarse stage after showing it to a recorder.
+
+    Args:
+        start: the coarse hand-eye.
+        seconds: wall time that it took.
+    """
     stage = coarse_stage(session, measurement, start, seconds)
     recorder.stage(stage, measurement.capture.poses(start.T_mount))
     return stage
 
 
 def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile | None) -> InitialModel | None:
-    """Return what gives the model from which effects beside another run's arm are fitted; None without any."""
+    """Return the function that builds the model from which the fit begins; None where it fits the hand-eye alone.
+
+    The function is called by the fit once a hand-eye is known.
+
+    Args:
+        effects: names of effects that are fitted.
+        arm: effects of joints and links of another run, which stay as they are.
+    """
     if not effects and not arm and not session.axes and not session.parts:
         return None
+    # A run without effects loads nothing of the diagnosis.
     from stitch.diagnosis.score import start_with_effects
 
     return partial(start_with_effects, session, effects, arm)
@@ -359,11 +419,14 @@ class _Conductor:
         recorders: Sequence[Recorder],
         register: str,
     ) -> None:
-        """Take what the steps of a run begin with, of every session in their order.
+        """Hold what the steps of a run begin with.
 
         Args:
-            coarse: stages of the coarse hand-eye, by session.
-            register: method.
+            sessions: all sessions of the rig, with all their views.
+            start: where the fit begins.
+            coarse: results of the coarse stage, one a session.
+            recorders: one a session, told of every stage.
+            register: name of the method by which single views are registered.
         """
         self._sessions = sessions
         self._start = start
@@ -376,12 +439,15 @@ class _Conductor:
         self._screened = Event()
 
     def fit(self, sessions: Sequence[SessionData], measurements: Sequence[Measurement]) -> FittedRig:
-        """Return the fit of the views that are left, and begin to register and to fuse them beside the screening.
+        """Return the fit of these views, and begin in other threads to register and to fuse them.
 
-        What was begun before, of more views, is ended. Recorders are shown what runs beside only once it is wanted:
-        until then a memory stands for each, and fusion waits until the screening has left all views in.
+        The screening calls this again each time it leaves views out; what was begun before is then stopped. This
+        thread fits. One further thread registers the views; before it reads whole clouds to fuse them, it waits until
+        `finish` sets the event `screened`. Another computes the hand-eye's covariance. A RecorderMemory stores the calls
+        of the registering thread, and `finish` replays them: views that are left out later are never shown.
         """
         self.close()
+        # A recorder that was told of a session with more views starts again.
         for whole, session, recorder in zip(self._sessions, sessions, self._recorders, strict=True):
             if len(session.views) < len(whole.views):
                 recorder.start(session)
@@ -391,6 +457,7 @@ class _Conductor:
         memories = self._memories = [RecorderMemory() for _ in sessions]
         screened = self._screened = Event()
 
+        # Called by the registering thread before fusion; the names are local, since a later `fit` replaces the fields.
         def until_screened() -> None:
             screened.wait()
             if memories[0].stopped:
@@ -402,12 +469,16 @@ class _Conductor:
             every = enumerate(zip(sessions, self._coarse, memories, strict=True))
             return [of_session(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
 
+        # `hand_eye` is a cached property: read here, it is at hand when the run is assembled.
         self._statistics = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
         self._finished = begin(finish)
         return fitted
 
     def finish(self) -> list[tuple[Fit, float]]:
-        """Wait until every session is registered and fused, and show it to its recorder; with its noise floor."""
+        """Return, a session each, what the stages found and the rms that perfect poses would leave (length_unit).
+
+        Lets fusion begin, waits for both threads, and replays their calls to the recorders.
+        """
         self._screened.set()
         fits = self._finished.result()
         for memory, recorder in zip(self._memories, self._recorders, strict=True):
@@ -416,14 +487,18 @@ class _Conductor:
         return fits
 
     def close(self) -> None:
-        """End what is under way: it is not wanted any more."""
+        """Stop the threads that were begun: each ends at its next call of a recorder, or when it waits to fuse."""
         for memory in self._memories:
             memory.stopped = True
         self._screened.set()
 
 
 def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
-    """Hold the hand-eye of another run against the one that the scans of each session show."""
+    """Return the fit with, for each session, how far the hand-eye of another run lies from what its scans show.
+
+    Where the two contradict each other, the session gets a doubt. `effects` and `model` are not needed here: the
+    function is called in the same place as `_check_against_own_model`.
+    """
     correction = screened.fitted.correction
     assert correction is not None
     screenings = []
@@ -437,7 +512,11 @@ def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: 
 
 
 def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
-    """Hold labelled points under the model of another run against a fit of hand-eye and targets from themselves."""
+    """Return the fit of labelled points with doubts where another run's model contradicts them.
+
+    The comparison is a fit of hand-eye and targets from these points themselves, with the arm's effects of `model`. It
+    is made only when the check asks for it.
+    """
     seen = screened.sessions, screened.measurements
 
     def fit() -> FittedRig:
@@ -450,7 +529,14 @@ def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], mode
 def _check_common_model(
     screened: ScreenedFit, hand_eyes: Sequence[CoarseHandEye], effects: Sequence[str], arm: ModelFile | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return notes on, and doubts of, what the sessions share: effects, and the arm of another run."""
+    """Return notes, and doubts, on what the sessions share: their effects, and the arm of another run.
+
+    Each session alone is fitted with `effects` to see whether the common values hold for it. The arm is judged by two
+    fits of all sessions, with it and without. Both kinds of fit are made only when a check asks for them.
+
+    Args:
+        hand_eyes: where the fits begin, one a session.
+    """
     sessions, measurements = screened.sessions, screened.measurements
     unit = sessions[0].length_unit
     notes: tuple[str, ...] = ()
@@ -474,7 +560,10 @@ def _check_common_model(
 
 
 def _sigma_anywhere(fitted: FittedRig, index: int) -> Array | None:
-    """Return sigma (6,) of the hand-eye with usual sizes of what the views cannot show; None without clouds."""
+    """Return the hand-eye's sigma (6,) at any pose the arm reaches, rotation first, rad and length_unit.
+
+    It includes effects of usual size that these views cannot show. None without clouds, and for several scanners.
+    """
     correction = fitted.correction
     if correction is None:
         return None
@@ -550,7 +639,10 @@ def _assemble_run(
 
 
 def _with_alone(run: RunData, alone: tuple[ScannerAlone, ...]) -> RunData:
-    """Return the run of several scanners with what each says by itself, and whether they agree; another as it is."""
+    """Return the run with the hand-eye of each scanner alone, and doubts where these contradict the common fit.
+
+    A run of one scanner is returned as it is.
+    """
     if not run.session.parts:
         return run
     run = replace(run, alone=alone)
@@ -559,7 +651,9 @@ def _with_alone(run: RunData, alone: tuple[ScannerAlone, ...]) -> RunData:
 
 
 def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
-    """Fit a run again with these effects in its model: matches, hand-eye and all effects.
+    """Return a run fitted again with `effects` as all the effects of its model: matches, hand-eye, parameters.
+
+    The ledger grows by one step. Effects that describe the geometry of the cell (external axes, scanners) always stay.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.
@@ -574,12 +668,14 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         effects = list(dict.fromkeys(effects))
         recorder.start(session)
         require_effects([measurement], effects)
+        # The fit begins at the parameters of the run's model, a new effect at zero or at its best event.
         new = [name for name in effects if name not in state.model.effects]
         model = start_with_effects(session, new, None, measurement, state.model, state.gate)
         model = model.with_terms([term for term in model.terms if term.is_geometry or term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
         hand_eye = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
         coarse = _show_coarse_stage(session, measurement, hand_eye, clock.lap(), recorder)
+        # No search and no screening: where the fit begins and which views belong is known from the first run.
         start = FitStart([hand_eye], model=model, gate=state.gate)
         register = state.register_method or DEFAULT
         with closing(_Conductor([session], start, [coarse], [recorder], register)) as conductor:

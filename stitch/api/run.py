@@ -106,7 +106,9 @@ class FittedHandEye(Value):
 def fitted_hand_eye(
     session: SessionData, capture: Capture, T_mount: Array, covariance: Array, *, unknown: tuple[str, ...]
 ) -> FittedHandEye:
-    """Return a hand-eye with its covariance, whose U is that of a point where the views of a capture see the part.
+    """Return a hand-eye with its covariance and the point at which its U is stated.
+
+    The point is where the views of the capture see the part: the mean over the views of their centroids, scanner frame.
 
     Args:
         T_mount: (4, 4) T_base_scanner (eye_to_hand) or T_flange_scanner (eye_in_hand), length_unit.
@@ -358,10 +360,10 @@ class Run(RunData):
 
 
 class ReplayRecorder(RecorderMemory):
-    """Recorder that keeps its calls, so that a recording can be written once the run is saved; it logs every stage.
+    """Recorder that stores its calls, so that a recording can be written once the run is saved; it logs every stage.
 
     Args:
-        other: gets every call too.
+        other: recorder that gets every call at once; None: nobody does.
         progress: is called with the line of each stage.
     """
 
@@ -371,17 +373,17 @@ class ReplayRecorder(RecorderMemory):
         self.progress = progress
 
     def tell(self, call: str, *arguments: Any) -> None:
-        """Keep one call, and pass it on."""
+        """Store one call, a method's name and its arguments, and make it on the other recorder."""
         super().tell(call, *arguments)
         getattr(self.other, call)(*arguments)
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Log one iteration."""
+        """Log one iteration and store the call."""
         _LOG.debug("%s, iteration %d: rms %.4g within %.4g", stage, index, rms, gate)
         super().iteration(stage, index, poses, rms, gate)
 
     def stage(self, result: StageResult, poses: Array) -> None:
-        """Say the end of a stage."""
+        """Log a stage that has ended, pass its line to `progress`, and store the call."""
         line = f"{result.name}: rms {result.rms:.4g}, {result.seconds:.1f} s"
         _LOG.info("%s", line)
         if self.progress is not None:
@@ -394,11 +396,11 @@ class ReplayRecorder(RecorderMemory):
 
 
 def public_run(run: RunData, whole: Session | None, recorder: ReplayRecorder | None = None) -> Run:
-    """Return a run as people hold it.
+    """Return a run as the public class `Run`, with the same values.
 
     Args:
         whole: its session with the views that were left out; None: as the run has it.
-        recorder: was told of it.
+        recorder: the one that was told of the run, whose calls are stored for a recording; None: no recording.
     """
     values = {f.name: getattr(run, f.name) for f in fields(RunData)}
     calls = () if recorder is None else tuple(recorder.calls)
@@ -418,10 +420,15 @@ def rigid_transform(pose: Array) -> Any:
 
 
 def _require_own_history(run: RunData, folder: Path, force: bool) -> None:
-    """Refuse a folder in which the model went another way, or somebody remarked on it.
+    """Refuse to overwrite a run unless its ledger is the beginning of this run's ledger.
+
+    The ledger is the list of the model's changes, with notes of people; overwriting another one would lose it.
+
+    Args:
+        force: overwrite in any case.
 
     Raises:
-        InputError: it holds such a run.
+        InputError: the folder holds a run with another ledger.
     """
     if force or not (folder / "ledger.json").is_file():
         return
@@ -436,10 +443,12 @@ def _require_own_history(run: RunData, folder: Path, force: bool) -> None:
 
 
 def _save_session_of_run(session: Session, folder: Path) -> Path:
-    """Write the session as FOLDER-session and return the path; one that lies there already has to be the same.
+    """Write the session as FOLDER-session and return its path; a session that lies there already stays.
+
+    It is compared by writing this one again elsewhere: the same files give the same hash.
 
     Raises:
-        InputError: it is another.
+        InputError: another session lies there.
     """
     beside = folder.with_name(f"{folder.name}-session")
     if not (beside / "session.toml").is_file():
@@ -455,5 +464,5 @@ def _save_session_of_run(session: Session, folder: Path) -> Path:
 
 
 def _entry_point(group: str) -> Callable[..., Any] | None:
-    """Return what another package offers under an entry-point group; None where there is none."""
+    """Return what the first installed package offers under an entry-point group; None where none does."""
     return next((entry.load() for entry in entry_points(group=group)), None)

@@ -131,7 +131,7 @@ class Session(SessionData):
         _require_kinds({"axes": axes}, Sequence)
         _require_kinds({"check": check}, bool)
         _require_kinds({f"axes, {k}": table for k, table in enumerate(axes)}, Mapping)
-        with _in_arguments(cell.path.name):
+        with _errors_name_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
             has_poses = poses is not None or joints is not None or not axes
             poses = _read_tables(cell, poses, scans, cloud_unit or unit) if has_poses else poses
@@ -173,7 +173,7 @@ class Session(SessionData):
         # Checked as a session.toml with the same entries is.
         toml = path / "session.toml"
         repeatability = StatedRepeatability()
-        with _in_arguments(path.name):
+        with _errors_name_arguments(path.name):
             table_choice(toml, {"unit": unit}, "unit", tuple(METRES))
             table_choice(toml, {"cloud_unit": cloud_unit or unit}, "cloud_unit", tuple(METRES))
             table_choice(toml, {"mount": mount}, "mount", get_args(Mount))
@@ -207,7 +207,7 @@ class Session(SessionData):
         return not (self.path / "session.toml").is_file()
 
     def save(self, folder: Path | str) -> "Session":
-        """Write the session into a new folder, whole or not at all, and return it as it lies there.
+        """Write the session into a new folder, whole or not at all, and return it with that folder as its path.
 
         `stitch run FOLDER` then does with it what `stitch.run(session)` does. Rotations are written as quaternions,
         whose last digit may differ.
@@ -233,13 +233,13 @@ def load_session(
     at_most: int | None = MAX_POINTS,
     memory: float | None = None,
 ) -> Session:
-    """Read and check a session folder.
+    """Return the session of a folder, read and checked.
 
     Args:
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
-        at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
-        memory: bytes within which a run of the session has to stay; may be less than `at_most` asks for.
-        start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
+        start: (n,) rad: joint angles of the only view of a folder without views.csv; no poses are planned there yet.
+        at_most: number of points of a view that stay in memory; the others are read when they are fused. None: all.
+        memory: bytes within which a run of the session has to stay; fewer points than `at_most` may follow from it.
 
     Raises:
         InputError: anything missing, contradictory or implausible; names file, line or view, and how to fix it.
@@ -252,14 +252,22 @@ def load_session(
 
 
 def public_session(session: SessionData) -> Session:
-    """Return a session that was read as the one that people hold."""
+    """Return a session as the public class `Session`, with the same values."""
     if isinstance(session, Session):
         return session
     return Session(**{f.name: getattr(session, f.name) for f in fields(SessionData)})
 
 
 def _require_kinds(arguments: Mapping[str, Any], kinds: Any) -> None:
-    """Refuse arguments, by name, that are none of some types."""
+    """Refuse a call with an argument of a wrong type.
+
+    Args:
+        arguments: values by name.
+        kinds: a type, or a union of types such as `str | None`.
+
+    Raises:
+        InputError: names the first such argument, and the types that are allowed.
+    """
     for name, value in arguments.items():
         if not isinstance(value, kinds):
             words = " or ".join(kind.__name__ for kind in get_args(kinds) or (kinds,)).replace("NoneType", "None")
@@ -267,7 +275,13 @@ def _require_kinds(arguments: Mapping[str, Any], kinds: Any) -> None:
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
-    """Return names of the views, and their scans; None where there are none."""
+    """Return the names of V views, and of each its scan; None for each where there are labelled points alone.
+
+    A mapping of clouds brings its names; otherwise they are v000, v001, …
+
+    Raises:
+        InputError: neither clouds nor labelled points.
+    """
     if isinstance(clouds, Mapping):
         names = [require_name("clouds", str(key), "view") for key in clouds]
         return names, list(clouds.values())
@@ -278,10 +292,12 @@ def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[s
 
 
 def _read_tables(cell: Session, poses: Any, scans: list[Any], cloud_unit: str) -> Any:
-    """Return poses that are rows of numbers as (V, 4, 4), where a package reads them as `stitch init` reads a table.
+    """Return poses given as rows of numbers as (V, 4, 4), where an installed package reads such tables.
 
-    Others stay as they are (entry-point group `stitch.pose_tables`).
+    Matrices and None are returned as they are; so is everything where no package offers `stitch.pose_tables`. The scans
+    (their lengths in `cloud_unit`) let the reader tell which convention the rows follow.
     """
+    # np.shape raises ValueError for lists of unequal lengths, which are no matrices.
     with suppress(ValueError):
         if poses is None or np.shape(poses)[1:] == (4, 4):
             return poses
@@ -291,7 +307,13 @@ def _read_tables(cell: Session, poses: Any, scans: list[Any], cloud_unit: str) -
 
 
 def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:
-    """Return T_base_flange (V, 4, 4) and joint angles (V, n) rad, which agree."""
+    """Return T_base_flange (V, 4, 4) and joint angles (V, n) rad; None in place of the angles where none are given.
+
+    Without poses the robot computes them from the angles; with both they have to agree.
+
+    Raises:
+        InputError: a wrong number of poses or angles, degrees in place of rad, or no poses and no robot.
+    """
     count = len(names)
     robot = cell.robot
     q = None if joints is None else per_view(joints, count, "joints", 2)
@@ -316,7 +338,13 @@ def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Arra
 
 
 def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session:
-    """Return the session with external axes by their [[axis]] tables; readings are covariates."""
+    """Return the session with the external axes that [[axis]] tables state; without tables as it is.
+
+    The readings of an axis are a covariate of each view, in exactly one of the axis' possible columns.
+
+    Raises:
+        InputError: a view without a reading of an axis, or with two.
+    """
     axes = read_axes(session.path / "session.toml", [dict(t) for t in tables], session.mount, session.has_poses)
     for axis in axes:
         columns = axis.columns(session.length_unit)
@@ -330,7 +358,17 @@ def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session
 
 
 def _measured_views(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[View]:
-    """Return views with what was seen, at no pose yet."""
+    """Return one view per name with its cloud or labelled points; the pose is still the identity, all else unknown.
+
+    Args:
+        cell: session without views, for its scanner and length unit.
+        scans: V clouds, or None for each.
+        points: V mappings from a target's name to its place (3,) in the sensor frame; None: no labelled points.
+        cloud_unit: length unit of the clouds, "mm" or "m".
+
+    Raises:
+        InputError: a view without a scan, or another number of mappings than views.
+    """
     if points is not None and len(points) != len(names):
         raise InputError(f"points: {len(points)} for {len(names)} views; to fix: pass one mapping a view, or None")
     empty = next((v for v, scan in enumerate(scans) if scan is None), None)
@@ -370,7 +408,17 @@ def _measured_views(cell: Session, names: list[str], scans: list[Any], points: A
 def _placed_views(
     views: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
 ) -> tuple[View, ...]:
-    """Return the views with poses (V, 4, 4), joint angles (V, n) rad, times and covariates."""
+    """Return the views with poses, joint angles, directions of approach, times and covariates filled in.
+
+    Args:
+        T: (V, 4, 4) T_base_flange, length_unit.
+        q: (V, n) joint angles, rad; None: unknown, and the approach too.
+        times: (V,) s that never decrease; None: unknown.
+        covariates: by name (V,) numbers; one that is not finite is left out of its view.
+
+    Raises:
+        InputError: times that decrease or are not finite, or values of another number than views.
+    """
     count = len(views)
     time = None if times is None else seconds_of(times, count, "times")
     if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
@@ -382,7 +430,7 @@ def _placed_views(
         name: per_view(values, count, f"covariates {name}")
         for name, values in zip(names, covariates.values(), strict=True)
     }
-    # As in views.csv: the sign of the difference to the view before.
+    # As in views.csv: the sign of the travel from the view before, 0 in the first view.
     approach = None if q is None else np.sign(np.diff(q, axis=0, prepend=q[:1]))
     return tuple(
         replace(
@@ -398,10 +446,10 @@ def _placed_views(
 
 
 def check_convention(session: Session) -> None:
-    """Refuse poses that the scans contradict, tried in both directions and in other orders as `stitch init` does.
+    """Refuse poses that the scans contradict: inverted ones, or with another order of angles or axes.
 
-    Where no package searches conventions (entry-point group `stitch.pose_checks`), they are as stated unless a deep
-    check contradicts.
+    An installed package that searches conventions decides (entry-point group `stitch.pose_checks`). Where there is
+    none, or it cannot tell, the deep check of `stitch check` does.
 
     Raises:
         InputError: another reading of the poses brings the scans together, or they lie in one frame already.
@@ -415,8 +463,11 @@ def check_convention(session: Session) -> None:
 
 
 @contextmanager
-def _in_arguments(path: str) -> Iterator[None]:
-    """Name arguments where messages name the files and keys of a folder; the sentences stay the same."""
+def _errors_name_arguments(path: str) -> Iterator[None]:
+    """Raise errors of the block again with names of arguments in place of those of files and keys.
+
+    The checks are those of a session folder, whose messages name session.toml. `path` is the name of the session.
+    """
     try:
         yield
     except StitchError as error:
@@ -427,7 +478,10 @@ def _in_arguments(path: str) -> Iterator[None]:
 
 
 def _files_of(session: SessionData) -> SessionFiles:
-    """Return everything that a folder of the session holds."""
+    """Return what a session folder has to hold, for a session to be read back from it with every digit.
+
+    Clouds are called after their views; where a name cannot be a file's, all are numbered.
+    """
     plain = all(_PLAIN.fullmatch(name) for name in session.names)
     files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
     clouds = {file: view.cloud for file, view in zip(files, session.views, strict=True) if view.cloud is not None}
@@ -453,7 +507,7 @@ def _files_of(session: SessionData) -> SessionFiles:
 
 
 class _WholeClouds(Mapping[str, Cloud]):
-    """Every point of every scan by its file, in memory one scan after the other."""
+    """Clouds by file name, each read with all its points only when it is asked for: one is in memory at a time."""
 
     def __init__(self, clouds: dict[str, Cloud]) -> None:
         self.clouds = clouds
@@ -470,10 +524,12 @@ class _WholeClouds(Mapping[str, Cloud]):
 
 
 def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, Sequence[object] | Array]:
-    """Return views.csv; an empty cell where nothing is known.
+    """Return the columns of views.csv by name, V entries each; None or "" becomes an empty cell: not known.
+
+    Angles in degrees, lengths in length_unit; poses are those that the robot reported, without external axes.
 
     Args:
-        files: of the scans; None where no view has one.
+        files: paths of the V scans inside the folder; None where no view has one.
     """
     views = session.views
     columns: dict[str, Sequence[object] | Array] = {"view": session.names}
@@ -494,7 +550,11 @@ def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, Se
 
 
 def _labelled_columns(session: SessionData) -> tuple[TableColumns | None, TableColumns | None]:
-    """Return the columns of points.csv, or of frames.csv where views show a probe."""
+    """Return the columns of points.csv and those of frames.csv; at least one of the two is None.
+
+    A view shows labelled points, (view, target, x, y, z), or one probe with its orientation (view and pose). Both lie
+    in the sensor frame, length_unit. A probe of unknown orientation is written without a turn, its sigma_deg empty.
+    """
     seen = {view.name: view.sighting for view in session.views if view.sighting is not None}
     if not seen:
         return None, None
@@ -516,7 +576,10 @@ def _known(name: str, values: Array) -> dict[str, Array]:
 
 
 def _tables(session: SessionData) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the tables of session.toml beside its head, and texts that lie beside it."""
+    """Return the tables of session.toml below its first keys, and texts of further files by name.
+
+    An arm without Denavit-Hartenberg rows came from a URDF, and is written as one again.
+    """
     stated = session.scanner
     scanner: dict[str, Any] = {"optical_axis": "-z" if stated.optical_axis[2] < 0 else "+z"}
     if stated.T_mount is not None and session.has_poses:
@@ -545,7 +608,13 @@ def _tables(session: SessionData) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _require_same(session: SessionData, folder: Path) -> None:
-    """Refuse a folder that reads back as another session."""
+    """Refuse a folder that reads back as another session than the one that was written.
+
+    Compared are names, poses, joints, times, covariates, labelled points and numbers of scanned points, to 1e-9.
+
+    Raises:
+        InputError: the folder cannot be read, or names the view and what differs.
+    """
     try:
         read = session_folder.load_session(folder)
     except InputError as error:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 
 def effects_with(run: RunData, further: Sequence[str], where: object) -> list[str]:
-    """Return the effects of a run's model and further ones, for `change`.
+    """Return the names of the effects in a run's model and further ones: the argument that `change` takes.
 
     Args:
-        where: name of the run, for messages.
+        further: names of effects to add.
+        where: name or folder of the run, the beginning of messages.
 
     Raises:
         InputError: an effect that is not known, that the session cannot have, or that is in the model already.
@@ -34,14 +35,22 @@ def effects_with(run: RunData, further: Sequence[str], where: object) -> list[st
 
 
 def with_prediction(run: RunData, heldout_rms: float) -> RunData:
-    """Return the run with the error that a diagnosis predicted of the last change of its model; NaN: it did not."""
+    """Return the run with, in the last step of its ledger, the error on views left out that a diagnosis predicted.
+
+    Args:
+        heldout_rms: length_unit; NaN: the diagnosis predicted none, and the run is returned as it is.
+    """
     if not isfinite(heldout_rms):
         return run
     return replace(run, ledger=(*run.ledger[:-1], replace(run.ledger[-1], predicted=heldout_rms)))
 
 
 def effects_without(run: RunData, dropped: Sequence[str], where: object) -> list[str]:
-    """Return the effects of a run's model but some, for `change`.
+    """Return the names of the effects in a run's model without some: the argument that `change` takes.
+
+    Args:
+        dropped: names of effects to take out.
+        where: name or folder of the run, the beginning of messages.
 
     Raises:
         InputError: an effect that is not in the model.
@@ -58,19 +67,22 @@ def suggest(
 ) -> tuple[RunData | None, list[str], Diagnosis]:
     """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
-    The run is None where nothing is named. What was found together is added together, and what does not hold its place
-    beside the rest goes again. An effect stays if it lowers the error on views left out beyond its uncertainty
-    (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. What is less likely
-    than nothing being missing is not added. What was in the model before stays; what was added gives way to other
-    effects that together do better.
+    The run is None where nothing is named. Each round diagnoses, adds the effects that the diagnosis names together,
+    and drops those that the others make unnecessary. An effect stays if it lowers the error on views left out beyond
+    its uncertainty (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. An
+    effect that is less likely than none is not added. Effects that were in the model at first stay; added ones are
+    exchanged for others that predict better. The rounds end when the diagnosis names nothing new, when an addition
+    fails, or when `at_most` effects are added.
 
     Args:
-        known: what a diagnosis of this state has named to be added; None: it is diagnosed.
+        at_most: number of effects that may be added.
+        known: what an earlier diagnosis of this state has named to be added; None: it is diagnosed.
         recorder: told of every run that is tried, one after the other.
     """
     lines: list[str] = []
     given = set(state.model.effects)
     left = at_most
+    # The last run to which something was added; `state` is the one that is diagnosed.
     result: RunData | None = None
     while True:
         diagnosis = None if known is not None and left else diagnose(state)
@@ -81,11 +93,12 @@ def suggest(
             fewer, happened = (None, []) if result is None else _drop_idle(result, given, recorder)
             if fewer is None or not happened:
                 return result, [*lines, *why], diagnosis
-            # In their place others may be added.
+            # Effects that turned out to be zero were dropped: the next diagnosis may name others in their place.
             lines += happened
             left += len(happened)
             state = result = fewer
             continue
+        # It holds of the first state alone.
         known = None
         before = result
         result, happened = _add_found(state, finding, left, given, recorder)
@@ -103,8 +116,11 @@ def suggest(
 
 
 def _finding_of(diagnosis: Diagnosis) -> Finding:
-    """Return what a diagnosis says in sentences, with what it says of several sessions and of views left out."""
+    """Return what adding effects needs of a diagnosis.
 
+    That is its sentences, the effects it names together, and by effect how well views left out are predicted.
+    """
+    # A run that is only fitted loads nothing of the diagnosis.
     from stitch.diagnosis.diagnosis import Finding
 
     notes = (f"{note}." for note in diagnosis.notes if note not in diagnosis.sentence)
@@ -113,7 +129,13 @@ def _finding_of(diagnosis: Diagnosis) -> Finding:
 
 
 def _reason_to_stop(diagnosis: Diagnosis, left: int, at_most: int) -> list[str] | None:
-    """Return why nothing is added after a diagnosis, in lines; None where something is."""
+    """Return why nothing is added after a diagnosis, as lines; None where an effect is to be added.
+
+    The lines are empty where the diagnosis names no single effect: its own sentences say so.
+
+    Args:
+        left: number of effects that may still be added, of `at_most` at first.
+    """
     if diagnosis.verdict != "missing_effect":
         return []
     name = diagnosis.effects[0]
@@ -128,10 +150,14 @@ def _reason_to_stop(diagnosis: Diagnosis, left: int, at_most: int) -> list[str] 
 def _add_found(
     state: RunData, finding: Finding, at_most: int, given: set[str], recorder: Recorder | None
 ) -> tuple[RunData, list[str]]:
-    """Return the run with what was found together, as far as it earns its place, and what happened.
+    """Return the run with the effects that a diagnosis named together, as far as they earn their place, and lines.
+
+    They are fitted at once; if they fail together, the first is fitted alone. If that fails too, the run comes back
+    unchanged, with the reason in `tried`.
 
     Args:
-        given: effects that stay in any case.
+        at_most: number of effects that may be added.
+        given: effects that were in the model at first, which are never dropped.
     """
     from stitch.diagnosis.thresholds import FAINT_SIGMAS
 
@@ -139,12 +165,14 @@ def _add_found(
     while names:
         tried, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
         kept = [name for name in names if name in tried.effects]
+        # Mean square error on views left out, with the effects over without.
         share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
         validation = finding.validations.get(names[0])
         zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
         reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
         if kept and reason is None:
             share_then = finding.validations[kept[0]].heldout if kept == [names[0]] and validation else float("nan")
+            # The diagnosis predicted the error with its first effect alone, so nothing of several.
             told = with_prediction(tried, state.heldout_or_fit_rms * share_then**0.5)
             return told, [*lines, f"Added {' and '.join(kept)}. With it:"]
         if len(names) == 1:
@@ -157,10 +185,14 @@ def _add_found(
 
 
 def _exchange_added(state: RunData, given: set[str], recorder: Recorder | None = None) -> tuple[RunData, list[str]]:
-    """Return the run with others in place of effects that were added in several rounds, where these do better, and
-    what happened: what was found first may hold the parameters of what would have come later.
+    """Return the run with the added effects exchanged for others that predict views left out better, and a line on it.
 
-    Of labelled points alone, as where effects are dropped.
+    Effects added in several rounds may be wrong together: an early one can take up what a later one would explain. The
+    run comes back as it is, without a line, where no other effects do better. Clouds are not asked: they would have to
+    be matched anew for each set of effects.
+
+    Args:
+        given: effects that were in the model at first, which stay.
     """
     from stitch.diagnosis.stepwise_selection import find_better_effects
     from stitch.diagnosis.thresholds import HELDOUT_FALL
@@ -177,9 +209,10 @@ def _exchange_added(state: RunData, given: set[str], recorder: Recorder | None =
 
 
 def suggest_group(state: RunData, recorder: Recorder | None = None) -> tuple[RunData | None, list[str], Diagnosis]:
-    """Return the run with all effects of an undecided group, what to say of it, and the diagnosis.
+    """Return the run with all effects fitted that a diagnosis cannot tell apart, lines on it, and a diagnosis.
 
-    The run is None where the diagnosis names no such group, or where the group does not help on views left out.
+    The diagnosis is that of the new run. The run is None where nothing is undecided, or where the group of effects
+    does not lower the error on views left out; the diagnosis is then that of `state`.
     """
     from stitch.diagnosis.validation import group_helps, group_share
 
@@ -210,10 +243,15 @@ def _finding_and_evidence(diagnosis: Diagnosis) -> list[str]:
 
 
 def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
-    """Return the run without added effects of which in the end no parameter differs from zero, or without which views
-    left out are predicted better, and what was dropped.
+    """Return the run without added effects that are not needed in the end, and a line for each that was dropped.
 
-    Scans are matched anew without an effect, which alone changes what views left out say: there it must be clear.
+    One at a time is dropped: first one whose every parameter is within `FAINT_SIGMAS` of zero. Otherwise every added
+    effect is left out in turn, and the one without which views left out are predicted best goes, if they are predicted
+    better. For clouds the error must fall by the factor `HELDOUT_RISE`, since matching them anew alone changes it.
+
+    Args:
+        given: effects that were in the model at first, which stay.
+        recorder: told of the runs that remain, not of those that are only compared.
     """
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_RISE
 
@@ -233,15 +271,20 @@ def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> t
                 return result, lines
             reason = f"without {faint} views left out are predicted better in the end"
         lines.append(f"{reason}; it was dropped.")
+        # Fitted once more, now shown.
         if recorder is not None:
             without[faint] = change(result, fewer[faint], recorder)
         result = replace(without[faint], tried=result.tried | {faint: reason})
 
 
 def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
-    """Return the run without added effects that others made idle, which it remembers, and why each was dropped.
+    """Return the run without added effects that the others make unnecessary, and a line on why for each of them.
 
-    Of labelled points alone: scans are matched anew for every effect that is asked.
+    The reasons are also kept in `tried` of the run. Clouds are not asked: they would have to be matched anew for every
+    effect.
+
+    Args:
+        given: effects that were in the model at first, which stay.
     """
     from stitch.diagnosis.stepwise_selection import find_effect_to_drop
 

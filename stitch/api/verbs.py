@@ -296,19 +296,26 @@ def report(
 
 
 def stored_state(run: RunData) -> RunData:
-    """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
+    """Return the run as a command would read it from its folder, so that both compute the same numbers.
+
+    The gate, the largest distance between partners in an overlap, is that of the model, as where a folder is read.
+    """
     with library_threads_off():
         return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
 
 
 def stored_cloud(run: RunData) -> FusedCloud:
-    """Return the stitched cloud with the digits that the run's folder keeps: stitched.ply is of single precision."""
+    """Return the stitched cloud rounded as stitched.ply keeps it, to single precision; arrays of float64 again."""
     names = ("points", "normals", "residual")
     return replace(run.fused, **{name: getattr(run.fused, name).astype(np.float32).astype(float) for name in names})
 
 
 def _require_sessions(sessions: Sequence[Any]) -> None:
-    """Refuse what is no session, and say what makes one."""
+    """Refuse a list with anything that is no session.
+
+    Raises:
+        InputError: says what the first such thing is, and how to make a session of it.
+    """
     odd = next((session for session in sessions if not isinstance(session, SessionData)), None)
     if isinstance(odd, str | Path):
         raise InputError(f"stitch.run: {odd} is a path; to fix: pass stitch.load_session({str(odd)!r})")
@@ -320,7 +327,13 @@ def _require_sessions(sessions: Sequence[Any]) -> None:
 
 
 def _names(effects: Sequence[str]) -> Sequence[str]:
-    """Refuse a text, whose letters would each be taken for a name."""
+    """Return names of effects as they are; a string in place of a list is refused.
+
+    Each of its letters would be taken for a name.
+
+    Raises:
+        InputError: `effects` is a string.
+    """
     if isinstance(effects, str):
         raise InputError(f"effects: {effects!r} is a text, and a list is asked for; to fix: pass [{effects!r}]")
     return effects
@@ -329,12 +342,13 @@ def _names(effects: Sequence[str]) -> Sequence[str]:
 def _models(
     model: ModelFile | RunData | None, arm: ModelFile | RunData | None
 ) -> tuple[ModelFile | None, ModelFile | None]:
-    """Return the model that is used as it is, and the arm that is kept."""
+    """Return `model` and `arm` of `run` as files of models state them; of an arm only effects of joints and links."""
     kept = keep_arm_effects(model_of(arm)) if isinstance(arm, RunData) else arm
     return model_of(model) if isinstance(model, RunData) else model, kept
 
 
 def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) -> Run:
+    """Return the run fitted again with exactly these effects; `recorder` is told of every stage."""
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
     return public_run(pipeline.change(stored_state(run), effects, replay), whole_session, replay)
