@@ -443,8 +443,8 @@ class _Conductor:
 
         The screening calls this again each time it leaves views out; what was begun before is then stopped. This
         thread fits. One further thread registers the views; before it reads whole clouds to fuse them, it waits until
-        `finish` sets the event `screened`. Another computes the hand-eye's covariance. A RecorderMemory stores the calls
-        of the registering thread, and `finish` replays them: views that are left out later are never shown.
+        `finish` sets the event `screened`. Another computes the hand-eye's covariance. A RecorderMemory stores the
+        registering thread's calls, and `finish` replays them: views that are left out later are never shown.
         """
         self.close()
         # A recorder that was told of a session with more views starts again.
