@@ -90,7 +90,7 @@ class LinearTrial(Protocol):
         """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Sum of squares by which left-out views lie off, in units of their scatter."""
+        """Sum of the squares of what left-out views deviate from the model by, in units of their scatter."""
 
     def influential_views(self, coefficients: Array) -> Indices:
         """(n,) views of which one alone could carry the coefficients (k,)."""
@@ -182,7 +182,12 @@ class LinearModel:
         return satterthwaite(self.mixed, self.null)
 
     def flange_scatter(self, fit: VarianceFit) -> Array:
-        """Return variances (2,) along an axis by which the flange turns and moves anew in a view, by its joints too."""
+        """Return the variances (2,) of the flange's scatter from view to view, along each axis: rad² and length_unit².
+
+        Args:
+            fit: variances [rotation, translation, noise factor, one per component of `component_names`]. The scatter
+                of the joints, if it is a component, moves the flange too and is added.
+        """
         white = fit.variances[:NOISE]
         if JOINT_SCATTER not in self.component_names:
             return white
@@ -215,17 +220,27 @@ class LinearModel:
         return whitener(self.mixed, self.null.variances)
 
     def whiten(self, columns: Array, blocks: Indices | None = None) -> Array:
-        """Return columns (n, P) in units of the null's scatter; of some of the blocks alone, if named."""
+        """Return columns (n, P) times the inverse Cholesky factor of the covariance: their errors are white, unit size.
+
+        The covariance is that of `null`, the variances fitted without further columns.
+
+        Args:
+            blocks: the blocks (rows of the B) whose columns are returned; None: all.
+        """
         X, half = self.in_blocks(columns), self.whitening
         if blocks is not None:
             X, half = X[blocks], half[blocks]
         return (half @ X).reshape(-1, columns.shape[1])
 
     def restricted(self, keep: Collection[str]) -> Self:
-        """Return the model in which poses err by these `causes` alone, sizes fitted anew; () leaves white scatter.
+        """Return the model in which poses err by these causes alone, its variances fitted anew.
 
-        Each set is fitted once. Where the covariance counts no scatter of known joints, it does if that is to stay.
+        White scatter and the sensor's noise always stay, so that () leaves these. Each set is fitted once and cached.
+
+        Args:
+            keep: names of effects or of components; those that are not among `causes` are ignored.
         """
+        # A model without a prior of pose errors can still be given the scatter of its joints, if it knows the joints.
         possible = self.causes if self.offsets is None else self.causes | {JOINT_SCATTER}
         kept = possible.intersection(keep)
         if kept == self.causes:
@@ -244,10 +259,11 @@ class LinearModel:
         return {}
 
     def _fit_restricted(self, kept: frozenset[str]) -> Self:
-        """Return the model with only those components of its pose errors that are kept, its variances fitted anew.
+        """Return the model with the pose errors `kept` alone, its variances fitted anew.
 
-        Without any, rotation and translation scatter and the sensor's noise remain. Labelled points and many views have
-        no prior of pose errors, and the offsets of their joints are the one component that can be kept.
+        Three cases. Nothing is kept: rotation scatter, translation scatter and the sensor's noise remain. The model has
+        a prior of pose errors: its components are restricted to the causes kept. It has none, as that of labelled
+        points or of many views: the scatter of the joints (`JOINT_SCATTER`) is the one component that can be added.
         """
         if not kept:
             mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
@@ -264,9 +280,10 @@ class LinearModel:
         return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     def refit(self) -> Self:
-        """Return the model with its variances fitted anew, from every place where their maximum may lie.
+        """Return the model with its variances fitted anew: the likeliest of the fits from several starts.
 
-        From the likeliest of these alone where there are many observations, since each fit takes long there.
+        The likelihood has several maxima, since some components of the covariance can stand in for others. Among more
+        than `_SINGLE_START_SIZE` observations a fit takes long, and only the likeliest start is used.
         """
         starts = [other.null for other in self.alternative_starts]
         starts += [at_variances(self.mixed, self.null.variances)] if self.full_model is None else []
@@ -277,18 +294,24 @@ class LinearModel:
 
     @cached_property
     def alternative_starts(self) -> tuple[Self, ...]:
-        """The same at other variances, where beside a further effect the maximum may lie.
+        """This model at two or three other variances, from which a fit of them may reach another local maximum.
 
-        Where there is nothing but scatter, as much as without other errors or as much as beside them; and where the
-        whole of the pose errors has them.
+        The variances are those of rotation scatter, translation scatter and noise, then one per pose error. The starts:
+
+        1. the three of the fit without pose errors, each pose error nearly 0;
+        2. the three of this model, each pose error nearly 0;
+        3. all those of `full_model`, the model that this one was restricted from, if there is one.
+
+        () without pose errors: the other maxima are those at which scatter stands in for pose errors.
         """
         if self.pose_errors is None:
             return ()
-        whole: LinearModel = self
-        while whole.full_model is not None:
-            whole = whole.full_model
-        few = _NEGLIGIBLE_SHARE * self.pose_errors.scales**2
-        starts = [np.append(fit.variances[: NOISE + 1], few) for fit in (whole.restricted(()).null, self.null)]
+        outermost: LinearModel = self
+        while outermost.full_model is not None:
+            outermost = outermost.full_model
+        nearly_none = _NEGLIGIBLE_SHARE * self.pose_errors.scales**2
+        white_fits = (outermost.restricted(()).null, self.null)
+        starts = [np.append(fit.variances[: NOISE + 1], nearly_none) for fit in white_fits]
         if self.full_model is not None and self.full_model.pose_errors is not None:
             fitted = self.full_model.null.variances
             by_name = dict(zip(self.full_model.pose_errors.names, fitted[NOISE + 1 :], strict=True))
@@ -324,7 +347,10 @@ class LinearModel:
         return column_space(self.white_design)
 
     def explained_without(self, views: Indices) -> Array:
-        """(n, r) orthonormal basis of what the model explains, with some views that move freely."""
+        """(n, r) orthonormal basis of the whitened columns of the model and of free motions of `views` (indices).
+
+        Projecting it out of the observations leaves these views out of a fit.
+        """
         twists = np.eye(6 * self.measurement.views.count)[:, (6 * views[:, None] + np.arange(6)).ravel()]
         return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
@@ -334,10 +360,12 @@ class LinearModel:
         return white - self._explained @ (self._explained.T @ white)
 
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
-        """Yield per set of columns (n, P) what the views tell of their coefficients θ beside the model.
+        """Yield I (P, P) and v (P,) per set of columns (n, P): the log likelihood of coefficients θ is vᵀθ − ½ θᵀIθ.
 
-        It is I (P, P) and v (P,) of the log likelihood vᵀθ − ½ θᵀIθ. Where sums of the model's own columns are kept,
-        so are those of these.
+        The model's own coefficients are free: they are projected out. The variances are those of the null.
+
+        Two ways give the same. Where all views have one covariance but for a rotation (`mixed.common`), sums over the
+        views are cached and each set is made of these. Else the columns are whitened, several sets in one product.
         """
         common = self.mixed.common if self.mixed.common is not None and self.mixed.sums.are_kept else None
         for sets in (columns[start : start + _SETS_AT_ONCE] for start in range(0, len(columns), _SETS_AT_ONCE)):
@@ -354,13 +382,13 @@ class LinearModel:
                 yield white[:, at].T @ white[:, at] - explained[:, at].T @ explained[:, at], vector[at]
 
     def information_of_motions(self, twists: Array, shapes: Array) -> tuple[Array, Array]:
-        """Return I (S, kR, kR) and v (S, kR) as `information` does, of motions that follow S sets of shapes.
+        """Return I (S, kR, kR) and v (S, kR): in each of S sets the log likelihood of kR coefficients is vᵀθ − ½ θᵀIθ.
 
-        A column is a motion of the views times a shape, so that its sums are sums over views of the motions' own,
-        each times what the shapes are there: none as long as what was seen is ever made.
+        Coefficient (i, r) moves view v by twists[v, :, i] · shapes[s, v, r]. So I and v are sums over the views of
+        6×6 matrices times products of two shapes; no column of all n observations is formed.
 
         Args:
-            twists: (V, 6, k) of the views about the observation's centre, per unit of each motion.
+            twists: (V, 6, k) of the views about the observation's centre (rad, length_unit), per unit of each motion.
             shapes: (S, V, R) factors of the views.
         """
         of_views, across, sign, vector = self._sums_of_twists
@@ -382,9 +410,14 @@ class LinearModel:
 
     @cached_property
     def _sums_of_twists(self) -> tuple[Array, Array, float, Array]:
-        """Unit twists of the views in sums: each view's own (V, 6, 6), across views the square of (V, r, 6) with its
-        sign, and against what the model leaves (V, 6)."""
+        """D (V, 6, 6), F (V, r, 6), sign s, q (V, 6): sums over unit twists of the views for `information_of_motions`.
+
+        With the 6 whitened unit twists of view v as columns U_v, the model's columns projected out, the information of
+        two views is U_vᵀU_w = δ_vw D_v + s F_vᵀF_w. q_v is U_vᵀ times the whitened residual.
+        """
         views, rows = self.measurement.views.count, self.observation.numbers_per_view
+        # Views share numbers: U_v has all n rows and is F_v itself. Else D_v is the block of the view, and what the
+        # model explains (an orthonormal basis of r columns) is subtracted by F.
         if rows is None:
             unit = self.residual(self.observation.from_twists(np.eye(6 * views)))
             across = unit.reshape(-1, views, 6).transpose(1, 0, 2)
@@ -402,14 +435,17 @@ class LinearModel:
     def conditioned_on(
         self, columns: Array | Sequence[SelectedColumns], sizes: Array, start: Array | None = None
     ) -> "LinearModel":
-        """Return the linear model with further free columns (n, p), of parameters of plausible sizes (p,).
+        """Return the model with p further columns in its free mean, its variances fitted anew; the last are cached.
 
         Args:
-            start: (c,) variances to begin with; None: those of the null.
+            columns: (n, p) reduced observations per unit of each parameter, as one array or as sets side by side.
+            sizes: (p,) plausible sizes of the parameters.
+            start: (c,) variances at which the fit begins; None: those of the null. With a prior of pose errors the fit
+                has starts of its own (`refit`), and this one is not used.
         """
         sets = [SelectedColumns(columns)] if isinstance(columns, np.ndarray) else columns
         if self.mixed.common is None:
-            # Nothing holds the whole sets: asked as columns.
+            # Only the sums of `common` are cached by set: without them the sets are one array of columns.
             sets = [SelectedColumns(np.hstack([selected.columns for selected in sets]))]
         key = (*(selected.key for selected in sets), sizes.tobytes())
         conditioned = self._conditioned.get(key)

@@ -41,14 +41,20 @@ def seen_part(captures: Sequence[Capture], scanner: int = 0) -> tuple[Array, flo
 def motion_gain(
     captures: Sequence[Capture], T_mount: Array, centre: Array, size: float, scanner: int = 0
 ) -> tuple[Array, Array]:
-    """Return gains (6,) ascending and the directions (6, 6) as columns, twists about the part's centre.
+    """Return gains (6,), ascending, of six directions of the hand-eye, and these directions (6, 6) as columns.
 
-    Of several scanners the others move freely too: what all together may do and nothing shows has no gain.
+    A direction is a twist ξ of the hand-eye, T_mount·exp(ξ), about the part's centre in the scanner's frame. It moves
+    view v by Ad(T_v) ξ. Its gain is the rms over the views of that motion less its mean, per unit of ξ, both as
+    displacements of the part: 0 where the motions of the session show nothing of it.
+
+    With several scanners the hand-eyes of the others are free: a direction that they can undo has no gain.
 
     Args:
-        centre, size: as `seen_part` has them; twists are taken about the centre, so that a rotation of the scanner is
-            not mistaken for the translation that it causes at the part.
-        scanner: the one that moves, among several.
+        T_mount: (4, 4) T_flange_scanner or T_base_scanner.
+        centre: (3,) of the part, scanner frame. About it, a rotation of the scanner is not mistaken for the translation
+            that it causes at the part.
+        size: of the part, length_unit: what makes a rotation a displacement.
+        scanner: number of the scanner that moves, among several.
     """
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
@@ -65,6 +71,7 @@ def motion_gain(
         total += np.einsum("vij,vik->jk", response, response)
         views += len(poses)
     if several > 1:
+        # The Schur complement lets the other scanners go where they fit best.
         at = np.arange(6 * scanner, 6 * scanner + 6)
         rest = np.setdiff1d(np.arange(len(total)), at)
         taken = total[np.ix_(at, rest)] @ np.linalg.pinv(total[np.ix_(rest, rest)], rcond=1e-9, hermitian=True)
@@ -74,12 +81,12 @@ def motion_gain(
 
 
 def visible_twists(captures: Sequence[Capture], T_mount: Array, part: tuple[Array, float]) -> Array:
-    """Return the twists (6, k) of the hand-eye that the motions show, T·exp(ξ); of all six the identity.
+    """Return a basis (6, k) of the twists ξ of the hand-eye, T_mount·exp(ξ), that the motions show: all six, if k = 6.
 
     Along the others nothing may be fitted: what rounded poses seem to say there is thousands of times the truth.
 
     Args:
-        part: as `seen_part` has it.
+        part: centre (3,) in the scanner's frame and size in length_unit, of `seen_part`.
 
     Raises:
         NoResultError: the motions show none.
@@ -100,22 +107,34 @@ def visible_twists(captures: Sequence[Capture], T_mount: Array, part: tuple[Arra
 
 
 def hidden_translations(captures: Sequence[Capture], T_mount: Array) -> Array:
-    """Return unit vectors (3, k), scanner frame, along which the hand-eye may shift and nothing shows."""
+    """Return unit vectors (3, k), scanner frame, along which no view shows a shift of the hand-eye.
+
+    A shift d of the scanner in the mount's frame moves view v by R_v d. Views show what differs between them,
+    (R_v − mean R) d, so that the hidden d are the eigenvectors of its mean square whose eigenvalue is nearly zero.
+
+    Args:
+        T_mount: (4, 4) maps scanner to mount.
+    """
     total, views = np.zeros((3, 3)), 0
     for capture in captures:
         R = capture.T_reference_mount[:, :3, :3]
-        off = R - R.mean(axis=0)
-        total += np.einsum("vji,vjk->ik", off, off)
+        deviation = R - R.mean(axis=0)
+        total += np.einsum("vji,vjk->ik", deviation, deviation)
         views += len(R)
     values, vectors = np.linalg.eigh(total / views)
     return T_mount[:3, :3].T @ vectors[:, values < _VISIBLE**2]
 
 
 def unknown_numbers(captures: Sequence[Capture], T_mount: Array, scanner: int = 0) -> tuple[str, ...]:
-    """Return which of x, y, z, rx, ry, rz of the hand-eye the motions leave open.
+    """Return the names among x, y, z, rx, ry, rz of the hand-eye's numbers that the motions do not determine.
 
-    They are position and rotation vector in the frame that carries the scanner. A number is open where what is hidden
-    changes it by more than a hundredth of what it does to the part.
+    They are position and rotation vector of T_mount, in the frame that carries the scanner. A number is undetermined if
+    a twist of gain below `_VISIBLE` (see `motion_gain`) changes it, as a displacement at the part, by more than that
+    share of the twist's own displacement.
+
+    Args:
+        T_mount: (4, 4) of the first scanner.
+        scanner: number of the scanner that is asked about.
     """
     centre, size = seen_part(captures, scanner)
     gains, directions = motion_gain(captures, T_mount, centre, size, scanner)
@@ -140,7 +159,13 @@ def unobservable(
     joints: Array | None = None,
     scanner: int = 0,
 ) -> tuple[str, ...]:
-    """Return one phrase per direction of the hand-eye that these motions cannot show."""
+    """Return one phrase per direction of the hand-eye that these motions cannot show, as "translation along …".
+
+    Args:
+        T_mount: (4, 4) of the first scanner.
+        robot, joints: kinematics and joint angles (V, n) rad, if known: a direction may then be named after a joint.
+        scanner: number of the scanner that is asked about.
+    """
     gains, directions = motion_gain(captures, T_mount, *seen_part(captures, scanner), scanner)
     axes = _named_axes(captures, robot, joints)
     # How far from the part a joint's axis may stand: the longest way through the cell.
@@ -152,14 +177,15 @@ def unobservable(
 
 
 def _split(hidden: Array, reach: float) -> list[tuple[str, Array]]:
-    """Return unit directions (scanner frame): translations first, then rotations, of the hidden space.
+    """Return k pairs (kind, unit direction (3,), scanner frame) that span the hidden twists, translations first.
 
     Args:
-        hidden: (6, k) twists about the part.
-        reach: a turn about an axis that stands farther off, or a screw of a longer pitch, is a translation.
+        hidden: (6, k) twists about the part's centre, rotation first.
+        reach: length_unit; a rotation about an axis farther off than this counts as a translation.
     """
     if hidden.shape[1] == 0:
         return []
+    # Combinations of the twists in the order of how much they turn (singular values `turned`).
     U, turned, Vt = np.linalg.svd(hidden[:3])
     shifted = np.linalg.norm(hidden[3:] @ Vt[: len(turned)].T, axis=0)
     rank = int(np.sum(turned * reach > shifted))
@@ -169,7 +195,11 @@ def _split(hidden: Array, reach: float) -> list[tuple[str, Array]]:
 
 
 def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array | None) -> dict[str, Array]:
-    """Directions in the mount frame that people know by name."""
+    """Return by name the directions (3,), mount frame, that people have a word for; {} where there are none.
+
+    They are the axes of joints that move, where these stand still in the mount frame, and the one axis about which all
+    views of the first capture were turned, if there is one.
+    """
     axes = dict[str, Array]()
     first = captures[0]
     if robot is not None and joints is not None:
@@ -182,6 +212,7 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
             # A joint's axis has a place in the mount frame only while it does not move there.
             if np.linalg.norm(axis.mean(axis=0)) > _PARALLEL:
                 axes[f"the axis of joint {i + 1}"] = axis.mean(axis=0)
+    # One axis if the rotation vectors from the first view to the others are parallel: one singular value beside zero.
     motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
     _, s, Vt = np.linalg.svd(motions, full_matrices=False)
     if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):

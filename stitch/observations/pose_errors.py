@@ -86,7 +86,10 @@ _MIN_WAVES, _WAVE_STEP, _SHORTEST_PERIOD, _MAX_WAVES = 2.0, 0.5, float(np.radian
 
 
 def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
-    """Return what the library knows of every joint and link, as far as all sessions can have it."""
+    """Return the physical effects of the library that every arm has: their parameters are one per joint or torque.
+
+    They depend on joint angles and torques alone. An effect is left out if a session lacks what it needs.
+    """
     possible = [
         e
         for e in EFFECTS.values()
@@ -97,7 +100,13 @@ def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
 
 
 def effect_twists(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
-    """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
+    """Return left twists (6V, P) of the views about `centre`, for a plausible size of each parameter of some effects.
+
+    Rotation (rad) before translation (length_unit), view after view, by the derivative at `model`.
+
+    Args:
+        centre: (3,) reference frame.
+    """
     in_use: dict[str, Term] = {term.name: term for term in model.terms}
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     derivatives = pose_derivatives(measurement, model, terms, centre)
@@ -105,7 +114,10 @@ def effect_twists(measurement: Measurement, model: Model, centre: Array, effects
 
 
 def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
-    """(6V, n) twists of the views for a plausible offset of every joint; None where no joints are known."""
+    """Return left twists (6V, n) of the views about `centre` (3,) for a plausible offset of each joint.
+
+    Rotation (rad) before translation (length_unit), view after view. None where the session states no joints.
+    """
     if not measurement.views.has("joints") or _OFFSET not in EFFECTS:
         return None
     return effect_twists(measurement, model, centre, [EFFECTS[_OFFSET]])
@@ -117,7 +129,9 @@ def usual_twist(length_unit: str) -> Array:
 
 
 def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
-    """(6V, 6) twists of all views of a rig by a flange that turns and moves by its usual sizes, in its own frame.
+    """Return left twists (6V, 6) of all views of a rig by usual rotations and translations of the flange.
+
+    The columns are rotations about, then translations along, the flange's own x, y and z: sizes as in `usual_twist`.
 
     Args:
         centres: per session the point (3,) about which twists count, reference frame.
@@ -131,10 +145,12 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
 
 
 def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
-    """Return mean squares (2,), rad² and length_unit², along an axis of the flange of what columns turn and move it by.
+    """Return the variances (2,), rad² and length_unit², per axis of the flange's rotation and translation by n errors.
+
+    They are means over the views and the three axes of the flange.
 
     Args:
-        columns: (6V, n) twists of the views, of unit variance each.
+        columns: (6V, n) left twists of the views per unit of each error; the errors are independent, of unit variance.
         centres: per session the point (3,) about which they count, reference frame.
     """
     flange = flange_twists(measurements, centres).reshape(-1, 6, 6)
@@ -145,10 +161,10 @@ def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], ce
 
 
 def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
-    """(V, V) how alike views err that are near in time; sessions are far from each other.
+    """Return correlations (V, V) that fall exponentially with the time between two views; 0 between sessions.
 
     Args:
-        memory: correlation time in steps from view to view.
+        memory: correlation time, in median steps from one view to the next.
     """
     counts = [m.views.count for m in measurements]
     out, at = np.zeros((sum(counts), sum(counts))), 0
@@ -174,15 +190,17 @@ def usual_time_step(measurement: Measurement) -> float:
 def joint_processes(
     measurements: Sequence[Measurement], joints: Array, offsets: Array, joint_kernel: Array
 ) -> dict[str, SmoothErrors]:
-    """Return what every joint may do by no law that anybody wrote down, by what it follows, for the sessions of a rig.
+    """Return random processes of the errors of each joint, by what the error depends on (`ALL_ANGLES`, `OWN_ANGLE`, …).
 
-    None of these processes is among the components of the prior of pose errors.
+    They stand for errors that no effect of the library describes: each is a Gaussian process with the kernel named, of
+    all joints or of those that move. None of them is a component of the prior of pose errors; diagnosis asks them.
 
     Args:
-        joints: (V, n) rad of all views.
-        offsets: (6V, n) twists of the views per unit of each joint.
-        joint_kernel: (V, V) of a smooth function of all joints.
+        joints: (V, n) rad of all views of the rig.
+        offsets: (6V, n) left twists of the views per unit of each joint's error.
+        joint_kernel: (V, V) correlations of a smooth function of all joint angles.
     """
+    # From the joints of the view before: the direction in which a joint came.
     came = joints - np.concatenate([m.views.previous for m in measurements])
     slowly = drift_kernel(measurements, DRIFT_MEMORY["slowly wandering"])
     every = tuple(range(joints.shape[1]))
@@ -194,8 +212,8 @@ def joint_processes(
         in_way = np.array([direction_kernel(joints[:, k], came[:, k]) for k in moving])
         processes[OWN_ANGLE] = SmoothErrors(offsets[:, moving], closely, moving)
         processes[TRAVEL] = SmoothErrors(offsets[:, moving], in_way, moving)
-    # As joints do that drag each other: of the many numbers that a function of all angles may have in few views, that
-    # of its own angle and one other's has a few.
+    # Joints drag each other. A function of two angles has few degrees of freedom, one of all angles too many for few
+    # views.
     pairs = [two for two in permutations(every, 2) if set(two) & set(moving)]
     if pairs:
         first, second = (tuple(column) for column in zip(*pairs, strict=True))
@@ -205,11 +223,14 @@ def joint_processes(
 
 
 def _periodic_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
-    """Return what each joint does again and again as it turns, as teeth of a gear or of a belt do; {} if none turns.
+    """Return the process of errors that are periodic in a joint's angle, as those of gears and belts; {} if none turns.
+
+    It has one kernel per joint and period. A joint that turned by R rad is tried with R/2, R/2.5, R/3, … as periods,
+    none shorter than `_SHORTEST_PERIOD`.
 
     Args:
         joints: (V, n) rad.
-        offsets: (6V, n) twists of the views per unit of each joint.
+        offsets: (6V, n) left twists of the views per unit of each joint's error.
     """
     waves = [
         (k, turned / count)
@@ -225,10 +246,12 @@ def _periodic_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors
 
 
 def _load_processes(measurements: Sequence[Measurement], offsets: Array) -> dict[str, SmoothErrors]:
-    """Return what each joint that is bent does under its load; {} where not the same is known of all sessions.
+    """Return the process of errors that follow the torques at each joint, one kernel per joint whose torque changes.
+
+    {} where no torque changes, or where the sessions do not know the torques of the same joints in the same way.
 
     Args:
-        offsets: (6V, n) twists of the views per unit of each joint.
+        offsets: (6V, n) left twists of the views per unit of each joint's error.
     """
     torques = [m.views.torques for m in measurements]
     first = torques[0]
@@ -245,7 +268,10 @@ def _load_processes(measurements: Sequence[Measurement], offsets: Array) -> dict
 
 
 def usual_sizes() -> dict[str, float]:
-    """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
+    """Return by component the variance that the errors of a usual arm have, in units of the squared plausible size.
+
+    The components of a stop (`STOP_COMPONENTS`) are left out: the others contain them.
+    """
     arm = ("joint_offset", "link_geometry", "joint_compliance", *EFFECT_FAMILY.values())
     return (
         dict.fromkeys(arm, _ARM_SCALE**2)
@@ -282,7 +308,10 @@ class PoseErrors:
 
     @property
     def of_ordinary_arm(self) -> "PoseErrors":
-        """The same in sizes of an arm that errs by its geometry most of all."""
+        """The same for an arm that errs mostly by its geometry: the scales of all other errors of the arm are reduced.
+
+        Kept are those of constant offsets and links (`_CONSTANT_EFFECTS`), and of what is no error of the arm.
+        """
         beside = self.arm_components & ~np.isin(self.names, _CONSTANT_EFFECTS)
         return replace(self, scales=np.where(beside, _BESIDE_GEOMETRY, 1.0) * self.scales)
 
@@ -293,7 +322,11 @@ class PoseErrors:
         return FurtherPrior(self.scales, shapes, self.arm_components, self.scatter)
 
     def project(self, reduction: Array) -> "PoseErrors":
-        """Return the errors of numbers that are made of twists of the views by `reduction` (n, 6V)."""
+        """Return the pose errors of n numbers that are linear in the twists of the views: R C Rᵀ for each component C.
+
+        Args:
+            reduction: R (n, 6V), from twists to these numbers.
+        """
         return replace(
             self,
             components=np.array([reduction @ C @ reduction.T for C in self.components]),
@@ -301,7 +334,11 @@ class PoseErrors:
         )
 
     def restricted(self, keep: Collection[str]) -> "PoseErrors":
-        """Return the pose errors of these causes alone: names of components, or of effects that are part of one."""
+        """Return the pose errors of these causes alone; a component loses the effects that are not among them.
+
+        Args:
+            keep: names of effects, or of components that are not made of effects.
+        """
         left = {name: part for name, part in self.effects.items() if name in keep}
         kept, components = list[int](), list[Array]()
         for i, name in enumerate(self.names):
@@ -331,10 +368,12 @@ def white_scatter_only(views: int) -> PoseErrors:
 def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres: Sequence[Array]) -> PoseErrors:
     """Return the prior of pose errors for the sessions of a rig: one arm, one scanner, one mount.
 
-    Of very many views white scatter alone.
+    It is a sum of components, each a covariance (6V, 6V) of the twists of all views and a usual σ (see the head of this
+    file). With joint angles: the families of effects, smooth errors, scatter of the joints. Always: wandering. Where
+    poses repeat: what scans of one stop share. Of more than `_MOST_VIEWS` views white scatter alone.
 
     Args:
-        model: hand-eye and effects in use; the arm errs beside these.
+        model: hand-eye and effects in use, about which the effects are linearised.
         centres: per session the point (3,) about which twists count, reference frame.
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
@@ -343,7 +382,7 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     parts, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     processes, by_joints = dict[str, SmoothErrors](), np.zeros(2)
     sessions = list(zip(measurements, centres, strict=True))
-    # Which views share what is anew at every stop.
+    # (V, V) 1 where two views are scans of one stop: they share an error that is drawn once per stop.
     anew = block_diag(*(m.capture.shares_stop for m in measurements))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])

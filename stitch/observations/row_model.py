@@ -29,7 +29,7 @@ _CARRIERS = 20
 
 @dataclass(frozen=True)
 class ReducedRows(Observation):
-    """What V views show in rows, as C blocks of d numbers, those beyond V of no view; a response counts these."""
+    """Rows of V views reduced to C blocks of d numbers: a block per view, then blocks of no view's own."""
 
     capture: Capture  # of the rows, without the effects in use
     centre: Array  # (3,) of the rows, reference frame
@@ -51,7 +51,10 @@ class ReducedRows(Observation):
         return flatten_blocks(self.reduction.reduce_twists(self.rows.lever @ moved.reshape(-1, 6, moved.shape[1])))
 
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
-        """Return numbers (C·d, P) of each term."""
+        """Return per term how the C·d reduced numbers answer to its P parameters, (C·d, P).
+
+        Effects that move a view as a whole answer by twists of the views, those that move points by rows of the points.
+        """
         of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
         out = list[Response]()
         for term in terms:
@@ -91,7 +94,7 @@ class ReducedRows(Observation):
         """Return the reduced observations as C blocks of d numbers, with their variance components.
 
         Components are rotation and translation scatter of the flange, and the sensor's noise. Landmarks that the
-        reduction has taken out leave as many numbers fewer that err independently.
+        reduction has eliminated each use up one independent number.
 
         Args:
             A: (C, d, a) columns of the free mean.
@@ -101,13 +104,13 @@ class ReducedRows(Observation):
         scattered = [reduction.reduce_twists(moved) for moved in rows.scattered]
         diagonal = noise[..., None] * np.eye(noise.shape[1])
         components = [moved @ moved.transpose(0, 2, 1) for moved in scattered]
-        alone = rows.landmarks.shape[2] - reduction.kept.shape[1]
+        eliminated = rows.landmarks.shape[2] - reduction.kept.shape[1]
         return MixedModel(
             -reduction.reduce(rows.residual[..., None])[..., 0],
             A,
             np.array([*components, diagonal]),
             fixed[..., None] * np.eye(noise.shape[1]),
-            rows.independent - alone,
+            rows.independent - eliminated,
             common=common_covariance([moved[: len(rows.lever)] for moved in scattered], noise, fixed),
             noise_only=reduction.noise_only,
         )
@@ -116,8 +119,12 @@ class ReducedRows(Observation):
 def row_model(measurement: Measurement, model: Model, rows: Rows) -> LinearModel:
     """Return the linear model of what a session shows in rows: hand-eye, landmarks and effects in use are free.
 
+    The variances are fitted twice: with all effects in use, which tells how clearly the rows show each parameter; then
+    without those that are not shown, if there are any.
+
     Args:
-        measurement: with the sightings that count.
+        measurement: with the sightings that count, others masked.
+        model: about which the rows are linearised.
     """
     extra = rows.columns_in_use(measurement, model)
     reduction = _reduction(measurement, model, rows)
@@ -153,7 +160,10 @@ def row_model(measurement: Measurement, model: Model, rows: Rows) -> LinearModel
 
 
 def _reduction(measurement: Measurement, model: Model, rows: Rows) -> RowReduction:
-    """Return the reduction that keeps all that any effect of points can move here, asked or in use."""
+    """Return the reduction of the rows to fewer numbers that loses nothing of any effect that moves points.
+
+    Counted are the effects in use and all of the library that this session could have, since diagnosis may ask them.
+    """
     views = measurement.views
     effects = [e for e in EFFECTS.values() if e.place in ("sensor", "shape")] + empirical_effects(views)
     terms = [term for term in model.terms if moves_points([term])]
@@ -161,6 +171,7 @@ def _reduction(measurement: Measurement, model: Model, rows: Rows) -> RowReducti
         if not missing_need(measurement, effect):
             terms += grid_terms(measurement, effect)
     of_points = [np.zeros((*rows.residual.shape, 0)), *rows.effect_columns(measurement, model, terms)]
+    # Rows without the sensor's noise that answer to landmarks: nominal places, whose variance is known.
     known = np.where((rows.noise == 0) & rows.landmarks.any(axis=2), rows.fixed, 0.0)
     return reduction_of(rows.residual, rows.lever, rows.landmarks, rows.noise, known, np.concatenate(of_points, axis=2))
 
@@ -179,20 +190,24 @@ class RowTrial:
 
     @cached_property
     def _others(self) -> Indices:
-        """(p,) the columns of all else than what is seen."""
+        """(p,) numbers of the columns that are no landmarks: the hand-eye's six, and all after the landmarks."""
         at = 6 + self.observation.reduction.kept.shape[1]
         return np.delete(np.arange(self.X.shape[2]), slice(6, at))
 
     @cached_property
     def _rows(self) -> Array:
-        """(B, m, p + 1) the columns, and what was seen as the last one, in units of the rows' sigmas."""
+        """(B, m, p + 1) the columns of `_others`, then the observations z, both divided by the sigma of each row."""
         rows, reduction = self.observation.rows, self.observation.reduction
         z = -reduction.per_sigma * rows.residual
         return np.concatenate([reduction.expand(self.X[..., self._others]), z[..., None]], axis=2)
 
     @cached_property
     def _weights(self) -> Array:
-        """(B, m) of each row alone, in those units."""
+        """(B, m) weights of the rows, 1/variance in squares of the rows' sigmas; 0 of absent rows.
+
+        A row of a view varies by the sensor's noise and by the scatter of the view's pose. Its correlation with other
+        rows is left out, as in the fit of a run.
+        """
         reduction = self.observation.reduction
         views, noise = len(reduction.of_views), self.linear.null.variances[NOISE]
         beyond = self.linear.covariance[:views] - noise * np.eye(reduction.of_views.shape[1])
@@ -202,7 +217,10 @@ class RowTrial:
         return np.where(reduction.per_sigma > 0, 1 / variance, 0.0)
 
     def _sums(self, blocks: slice | Indices) -> tuple[Array, Array, Array]:
-        """Return sums over some blocks: of unknowns (U, U), of these with the columns (U, p + 1), of the columns."""
+        """Return weighted sums over the rows of some blocks: LᵀWL (U, U), LᵀWX (U, p + 1) and XᵀWX (p + 1, p + 1).
+
+        L are the columns of the U unknown landmarks, X those of `_rows`, with the observations as the last one.
+        """
         rows, weights = self._rows[blocks], self._weights[blocks].ravel()
         B, m = self._weights.shape
         points = self.observation.reduction.points[(np.arange(B)[blocks][:, None] * m + np.arange(m)).ravel()]
@@ -220,7 +238,15 @@ class RowTrial:
         return self.solve_each([CoefficientPrior(nothing, nothing)], left_out)[0]
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """Return coefficients (U + k,) under each prior, without some views; zero beyond those that it is of."""
+        """Return coefficients (U + k,) by weighted least squares under each prior: U landmarks, then the k columns.
+
+        The normal equations are those of the landmarks L and the columns X. The landmarks are eliminated (Schur
+        complement), the rest is solved under the prior, and the landmarks follow.
+
+        Args:
+            priors: each of the first coefficients of the columns; those beyond it are held at zero.
+            left_out: numbers of views whose rows are not counted; None: all count.
+        """
         unknowns, across, own = self._all
         if left_out is not None:
             some = self._sums(np.asarray(left_out, np.int64))
@@ -242,7 +268,7 @@ class RowTrial:
         return [self._with_kept(solution) for solution in solutions]
 
     def _inverse(self, unknowns: Array) -> Array:
-        """(U, U) inverse of sums of the unknowns; of one that no view shows nothing."""
+        """(U, U) inverse of the landmarks' normal matrix (U, U); zero for a landmark that no view shows."""
         diagonal = np.diag(unknowns)
         if (unknowns == np.diag(diagonal)).all():
             shown = diagonal > 1e-12 * np.diag(self._all[0])
@@ -250,28 +276,41 @@ class RowTrial:
         return symmetric_inverse(unknowns)
 
     def _with_kept(self, solution: Array) -> Array:
-        """Return a solution (U + k,) with the combinations of the unknowns that columns stand for."""
+        """Return a solution (U + k,) in which the columns of landmarks, so far zero, have their coefficients too.
+
+        The reduced model has r columns for combinations of the U landmarks: their coefficients follow from these.
+        """
         shares = self.observation.reduction.shares
         count, unknowns = shares.shape
         solution[unknowns + 6 : unknowns + 6 + count] = shares @ solution[:unknowns]
         return solution
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """(V,) sums of the squares of a view's distances, of all views or of some."""
+        """(V,) sums of the squares of a view's residual distances, length_unit², under coefficients (U + k,).
+
+        Args:
+            units: views whose sums are returned; None: all.
+        """
         rows = self.observation.rows
         units = np.arange(len(rows.lever)) if units is None else units
         sigmas = np.sqrt(rows.noise[: len(rows.lever)] * rows.distances_used)[units]
         return np.sum((self._rest(coefficients, units) * sigmas) ** 2, axis=1)
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Sum of the squares of what left-out views show, in units of their scatter and the sensor's noise."""
+        """Return the χ² of the residuals of left-out views under coefficients (U + k,).
+
+        Directions in which a view's pose scatters are whitened by its covariance; all others are divided by the noise.
+        """
         rest = self._rest(coefficients, left_out)[..., None]
         of_pose = self.observation.reduction.of_views[left_out] @ rest
         beyond = float(np.sum(rest**2) - np.sum(of_pose**2)) / self.linear.null.variances[NOISE]
         return float(np.sum((self.linear.whitening[left_out] @ of_pose) ** 2)) + beyond
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """(n,) the views without which the coefficients would move most, to first order."""
+        """(n,) at most `_CARRIERS` views, in the order of how far the coefficients move without each, to first order.
+
+        It is the norm of H⁻¹ g_v, with H the normal matrix without the landmarks and g_v the gradient of view v alone.
+        """
         unknowns, across, own = self._all
         held = self._inverse(unknowns) @ across[:, :-1]
         V, m = len(self.observation.rows.lever), self._weights.shape[1]
@@ -284,7 +323,7 @@ class RowTrial:
         return np.argsort(-sizes, kind="stable")[:_CARRIERS].astype(np.int64)
 
     def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
-        """(n, m) what is left of some views, in units of the rows' sigmas."""
+        """(n, m) residuals of n of the views under coefficients (U + k,), in units of the rows' sigmas."""
         V, m = len(self.observation.rows.lever), self._weights.shape[1]
         points = self.observation.reduction.points
         placed = (points[: V * m] @ coefficients[: points.shape[1]]).reshape(V, m)

@@ -40,7 +40,11 @@ class RowReduction:
         return views - (-(len(self.beyond) + int(self.known.sum())) // size)
 
     def reduce(self, rows: Array) -> Array:
-        """Return reduced numbers (C, d, P) of rows (B, m, P): by view, of views together, and of known variance."""
+        """Return the reduced numbers (C, d, P) of P columns of rows (B, m, P).
+
+        Every row is divided by its sigma. First come d numbers a view, then those that mix views (`beyond`), then one
+        per row of known variance; zeros fill the last block.
+        """
         views = len(self.of_views)
         white = self.per_sigma[..., None] * rows
         own = flatten_blocks(self.of_views @ white[:views])
@@ -52,7 +56,10 @@ class RowReduction:
         return self._in_blocks(flatten_blocks(self.of_views @ (self.per_sigma[: len(rows), :, None] * rows)))
 
     def expand(self, numbers: Array) -> Array:
-        """Return rows (B, m, P) in units of their noise that have numbers (C, d, P), but for places of targets."""
+        """Return rows (B, m, P), divided by their sigmas, that `reduce` makes numbers (C, d, P) of: the shortest such.
+
+        What the places of eliminated targets do to the rows is not among them.
+        """
         views, _, m = self.of_views.shape
         P = numbers.shape[2]
         out = np.zeros((*self.per_sigma.shape, P))
@@ -66,13 +73,16 @@ class RowReduction:
 
     @property
     def present(self) -> tuple[Array, Array]:
-        """(C, d) one where a number has the sensor's noise, and where its variance is known, 1, as of absent ones."""
+        """Return two (C, d) arrays of 0 and 1: where a number has the sensor's noise, and where its variance is 1.
+
+        The second are the rows of known variance, in units of their sigma, and numbers that are absent.
+        """
         of_views = self.of_views.any(axis=2).astype(float).reshape(-1, 1)
         noise = self._in_blocks(np.concatenate([of_views, np.ones((len(self.beyond), 1))]))[..., 0]
         return noise, 1 - noise
 
     def _in_blocks(self, numbers: Array) -> Array:
-        """(C, d, P) of the first numbers (n, P), the others absent."""
+        """Return numbers (n, P) as blocks (C, d, P), n ≤ C·d, filled up with zeros."""
         size, P = self.of_views.shape[1], numbers.shape[1]
         out = np.zeros((self.blocks * size, P))
         out[: len(numbers)] = numbers
@@ -80,9 +90,12 @@ class RowReduction:
 
 
 def pose_numbers(lever: Array) -> Array:
-    """Return orthonormal rows (V, d, m) that span what twists make of each view, (V, m, 6) in units of the noise.
+    """Return per view d = min(m, 6) orthonormal rows of length m, (V, d, m), that span the columns of its lever.
 
-    Of a view that shows less than its whole pose the last ones are zero.
+    The last ones are zero in a view that shows less than six numbers of its pose.
+
+    Args:
+        lever: (V, m, 6) change of the m rows of a view per twist of it, each row divided by its sigma.
     """
     length = np.sqrt(np.maximum((lever**2).sum(axis=(0, 1)), 1e-300))
     turned, sizes, _ = np.linalg.svd(lever / length, full_matrices=False)
@@ -93,15 +106,19 @@ def pose_numbers(lever: Array) -> Array:
 def reduction_of(
     residual: Array, lever: Array, unknowns: Array, noise: Array, known: Array, of_points: Array
 ) -> RowReduction:
-    """Return the reduction that keeps all that motions of views, unknowns and effects of points move.
+    """Return the map of all rows to few numbers that are sufficient for poses, landmarks and effects of points.
+
+    In units of the rows' sigmas: d numbers a view span what its motion does; the landmarks that no pose depends on are
+    eliminated (`alone`); of the rest the directions that other landmarks and effects move are kept (`beyond`). What is
+    left over is noise alone, and only its sum of squares is kept.
 
     Args:
-        residual: (B, m) what is left.
-        lever: (V, m, 6) rows of the first V blocks per twist of the view.
-        unknowns: (B, m, U) rows per unknown.
+        residual: (B, m) of the rows; their units are squared in `noise` and `known`.
+        lever: (V, m, 6) change of the rows of the first V blocks per twist of the view.
+        unknowns: (B, m, U) change of the rows per unknown landmark.
         noise: (B, m) variance of the sensor; 0 where a row has none.
-        known: (B, m) variance that is known; 0 of absent rows and of those of the sensor.
-        of_points: (B, m, P) rows per parameter of effects that move points within a view.
+        known: (B, m) variance of rows that are no sensor's; 0 elsewhere, also where a row is absent.
+        of_points: (B, m, P) change of the rows per parameter of effects that move points within a view.
     """
     (V, m, _), U = lever.shape, unknowns.shape[2]
     variance = noise + known
@@ -112,6 +129,7 @@ def reduction_of(
     per_length = np.where(length > 0, length, np.inf) ** -1
     turn = by_view(of_views)
     in_views = points[: V * m]
+    # What landmarks do to poses and to known rows: combinations that do nothing there are seen by noise alone.
     shown = np.vstack([(turn @ in_views).toarray(), points[V * m :].toarray()]) * per_length
     _, sizes, directions = np.linalg.svd(np.linalg.qr(shown, mode="r"))
     rank = int((sizes > _ROUNDING * sizes.max(initial=1e-300)).sum())
@@ -121,7 +139,7 @@ def reduction_of(
     of_alone = symmetric_inverse(information) if alone.size else information
 
     def rest(white: Array) -> Array:
-        """(V·m, P) what neither poses nor targets that noise alone shows can make."""
+        """Return columns (V·m, P), what poses and the landmarks `alone` can make projected out."""
         white = white - turn.T @ (turn @ white)
         return white - in_views @ (alone @ (of_alone @ (alone.T @ (in_views.T @ white))))
 
@@ -137,14 +155,18 @@ def reduction_of(
 
 
 def by_view(of_views: Array) -> csr_array:
-    """(V·d, V·m) the rows of every view in its place."""
+    """Return the block-diagonal sparse matrix (V·d, V·m) of V matrices (V, d, m)."""
     V, d, m = of_views.shape
     columns = np.broadcast_to((np.arange(V)[:, None] * m + np.arange(m))[:, None], (V, d, m))
     return csr_array((of_views.ravel(), columns.ravel(), np.arange(V * d + 1) * m), shape=(V * d, V * m))
 
 
 def _row_space(rest: Array, whole: Array) -> Array:
-    """(e, n) orthonormal rows of what is left (n, P) of whole columns, rounding apart."""
+    """Return orthonormal rows (e, n) that span the columns `rest` (n, P), without those that are rounding.
+
+    Args:
+        whole: (n, P) the same columns before something was projected out; they say what rounding is.
+    """
     length = np.linalg.norm(rest, axis=0)
     there = length > _ROUNDING * np.linalg.norm(whole, axis=0)
     Q, R = np.linalg.qr(rest[:, there] / length[there])

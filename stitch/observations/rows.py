@@ -67,7 +67,10 @@ class Rows(ABC):
         return float(max(np.median(away), 1e-9))
 
     def effect_columns(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
-        """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
+        """Return per term the change (B, m, P) of the rows per unit of each of its parameters, at `model`.
+
+        An effect that moves a view as a whole acts through `lever`; one that moves points, through the targets.
+        """
         of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
         poses = self.capture.poses(self.T_mount)
         out = []
@@ -91,7 +94,13 @@ class Rows(ABC):
         return np.concatenate([np.zeros((*self.residual.shape, 0)), *columns], axis=2)
 
     def mixed_model(self, A: Array) -> MixedModel:
-        """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
+        """Return the mixed model of the rows: a block of m rows a view, then the blocks of no view.
+
+        Its three components are rotation scatter and translation scatter of the flange, and the sensor's noise.
+
+        Args:
+            A: (B, m, a) columns of the free mean.
+        """
         V, (B, m) = len(self.lever), self.residual.shape
         components = np.zeros((3, B, m, m))
         for i, scattered in enumerate(self.scattered):
@@ -104,11 +113,11 @@ class Rows(ABC):
 
     @property
     def independent(self) -> int:
-        """Return how many numbers err independently: from these the unknowns of a fit are subtracted.
+        """Return how many numbers err independently; less the unknowns of a fit, they are its degrees of freedom.
 
-        The pose of a view errs in six ways, however many rows it shows: it counts six, or its rows where they are
-        fewer. What a view shows beyond its pose goes into the U unknowns of the landmarks, which are counted here, as
-        they are subtracted later; but for the six motions of all landmarks as one, which are motions of the views too.
+        A view counts six, as many as its pose has, or its rows where they are fewer. The U unknowns of the landmarks
+        are added, since a fit subtracts them later; all but six, the motions of all landmarks as one body, which the
+        poses have already.
         """
         rows_of_poses = np.minimum(self.used.sum(axis=1), 6).sum()
         return int(rows_of_poses) + max(self.landmarks.shape[2] - 6, 0)

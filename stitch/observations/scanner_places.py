@@ -65,10 +65,13 @@ class ScannerPlace(Value):
 def scanner_places(
     measurement: Measurement, model: Model, alone: tuple[ScannerAlone, ...] = ()
 ) -> tuple[ScannerPlace, ...]:
-    """Return where several scanners stand; none of one.
+    """Return where each of several scanners stands, with covariance and U, under a model of all; () of one scanner.
+
+    T_mount_scanner k is T_mount · T_first_scanner(k): the hand-eye of the first scanner, and a part of the model, the
+    effect `SCANNER_PLACEMENT`, for where the others stand from it. The covariance follows by J Σ Jᵀ from both.
 
     Args:
-        alone: of each scanner, or none.
+        alone: hand-eyes that single scanners have from their own views alone; the places say how far they are off.
     """
     scanners = measurement.views.scanners
     capture = measurement.capture
@@ -78,7 +81,7 @@ def scanner_places(
     known = model.effects_covariance
     rows = [f"{term.name}.{p.name}" for p in term.parameters]
     K = len(scanners.names) - 1
-    # Parameters stand rotations of all first, then their shifts; here scanner by scanner.
+    # The parameters are ordered rotation vectors of all scanners, then translations; here they go scanner by scanner.
     order = np.arange(6 * K).reshape(2, K, 3).transpose(1, 0, 2).reshape(K, 6)
     moved = np.vstack([np.zeros(6), term.values[order]])
     known_by_name = {name: i for i, name in enumerate(known.names)}

@@ -24,8 +24,9 @@ from stitch.session.measurement import Measurement
 # Correspondences whose slopes are held at a time: some megabytes, whatever the session's size. One block after the
 # other: threads that take turns at so many small calls need longer than one.
 _BLOCK = 20_000
-# Pairs are asked in squares of so many views by so many, so that a view of many is asked for many pairs at once.
-_SQUARE = 8
+# Pairs are taken in tiles of the views × views matrix, so many views wide: a block of pairs then has few views, and
+# each view is asked for its points' slopes once a block.
+_TILE = 8
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,12 @@ class PointGram:
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
     def merge_sides(self, per_view: int) -> "PointGram":
-        """Return the sums for parameters that all views share, from those for parameters of each view of a pair.
+        """Return the sums for parameters that all views share, from sums that count them for each view of a pair.
+
+        A is the linear map from shared parameters to those of the sums: both copies of one are its value.
 
         Args:
-            per_view: parameters that either view of a pair has for itself; they come first, twice.
+            per_view: number of parameters in the sums twice: first those of view v, then those of view w, then others.
         """
         shares = np.vstack([np.eye(per_view), np.eye(per_view)])
         rest = self.residual.shape[1] - 2 * per_view
@@ -55,7 +58,12 @@ class PointGram:
 def view_responses(
     measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
 ) -> list[Response]:
-    """Return per term the twists (6V, P) of the views, and the sums over pairs of those that change the points."""
+    """Return per term the left twists (6V, P) of the views, in rad and length_unit per unit of its P parameters.
+
+    The twists are about the centre of the overlaps. Of effects that move a view as a whole they are the derivative of
+    its pose. Of effects that move points within a view they are what the overlaps would make of the moved points
+    (`apparent_twists`), and the response holds the sums over pairs too.
+    """
     of_points = [term for term in terms if moves_points([term])]
     of_views = [term for term in terms if not moves_points([term])]
     sums = None
@@ -70,6 +78,7 @@ def view_responses(
     twists = apparent_twists(sums, unconstrained) if sums else None
     derivatives = pose_derivatives(measurement, model, of_views, unconstrained.overlaps.gram.centre)
     responses, at = [], 0
+    # The sums and `derivatives` hold each kind in the order of the terms.
     for term in terms:
         if sums is not None and twists is not None and moves_points([term]):
             columns = slice(at, at + len(term.parameters))
@@ -99,14 +108,19 @@ def stream_point_sums(
     of_targets: Callable[[], Array],
     per_view: int = 0,
 ) -> PointGram:
-    """Return the sums of all pairs, streamed once, a block of rows at a time.
+    """Return the sums over the correspondences of each pair of views for K parameters that move points.
+
+    e is the distance of a correspondence, g its change per unit of each parameter, B its change per twist of a view,
+    w its weight: the sums are Σ w Bᵀg, Σ w g e and Σ w g gᵀ. Correspondences go by in blocks, so that memory does not
+    grow with their number. Pairs of labelled points follow those of surfaces.
 
     Args:
-        noise_factor: of the capture, by which labelled points count beside the surfaces.
-        of_points: (K, N, 3) how far some points of view v move per unit, scanner frame.
-        of_targets: (K, V, S, 3) the same for all labelled points.
-        per_view: so many of the K are parameters of every view: the sums hold those of the first view of a pair, then
-            those of the second, then the others.
+        noise_factor: variance between surfaces over that of independent noise; labelled points are weighted by it.
+        of_points: called with a view and numbers (N,) of its points; returns how far these move per unit of each
+            parameter, (K, N, 3), scanner frame, length_unit.
+        of_targets: returns the same for all labelled points, (K, V, S, 3).
+        per_view: the first `per_view` of the K have a value of their own in each view. The sums then hold them twice,
+            for the first and for the second view of a pair, before the others.
     """
     g = unconstrained.overlaps.gram
 
@@ -134,28 +148,42 @@ def stream_point_sums(
 
 
 def _split_by_view(changes: Array, per_view: int) -> Array:
-    """(…, K + apart) of changes (…, 2, K) that the two views of a pair cause."""
+    """Return the changes of a distance per parameter, (…, K + per_view), from those by each view of a pair, (…, 2, K).
+
+    The first `per_view` parameters count once for each view; of the others the changes by both views are added.
+    """
     sides = [changes[..., side, :per_view] for side in range(2)] if per_view else []
     return np.concatenate([*sides, changes[..., per_view:].sum(axis=-2)], axis=-1)
 
 
 def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
-    """Pairs and their numbers, square by square, as many at a time as fill a block; a larger one in parts."""
+    """Yield blocks of at most `_BLOCK` correspondences: lists of a match, or a part of a large one, with its number.
+
+    Matches are sorted by tiles of the views × views matrix, so that a block has few views.
+    """
     block, rows = list[tuple[int, Match]](), 0
-    for pair, m in sorted(enumerate(matches), key=lambda item: (item[1].v // _SQUARE, item[1].w // _SQUARE, item[0])):
+    for number, m in sorted(enumerate(matches), key=lambda item: (item[1].v // _TILE, item[1].w // _TILE, item[0])):
         for start in range(0, len(m.residual), _BLOCK):
             part = m.subset(slice(start, start + _BLOCK))
             if block and rows + len(part.residual) > _BLOCK:
                 yield block
                 block, rows = [], 0
-            block.append((pair, part))
+            block.append((number, part))
             rows += len(part.residual)
     if block:
         yield block
 
 
 def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
-    """(N, 2, K) how the distances of all N correspondences of some pairs change by either view; each is asked once."""
+    """Return the changes (N, 2, K) of the distances of N correspondences by the points of the first and second view.
+
+    Per unit of each of K parameters, all matches one after the other. The point of the second view counts negative, as
+    in the distance. Each view is asked once for all its points, since a call costs more than its points.
+
+    Args:
+        slopes: called with a view, numbers (n,) of its points and their normals (n, 3); returns (n, K), how far these
+            points move along the normals.
+    """
     ends = np.cumsum([len(m.residual) for m in matches])
     normal = np.concatenate([m.normal for m in matches])
     # Per side of a pair the view, its points, the rows of the pair, and whether it is the second view.

@@ -95,11 +95,16 @@ def field_error(
     alpha: float,
     nuisance_effects: Sequence[Term] = (),
 ) -> FieldError:
-    """Return the smooth errors of the scanner that the overlaps show: of all views alike, and of single views.
+    """Return the smooth errors of the scanner that the overlaps show: those that all views share, and those by view.
+
+    Each is tested against `ALARM_SHARE`, the size that every scanner has, at half of the level. Errors of single views
+    are tested while shared ones may have any size. Shared errors are tested so too where those of single views are
+    clearer, else in a likelihood without errors of single views.
 
     Args:
-        alpha: chance at which an error counts that is none.
-        nuisance_effects: effects of points, of any size, that explain what they can first.
+        model: under which the effects are linearised.
+        alpha: level of the tests: probability of a false alarm.
+        nuisance_effects: effects that move points, with parameters of any size; what they can explain is no error here.
     """
     sums, noise = sum_smooth_errors(
         measurement, unconstrained, PointSlopes(measurement, nuisance_effects, model), per_view=True
@@ -110,13 +115,13 @@ def field_error(
     each = view_error_likelihood(sums, unconstrained, noise, nuisance)
     # Two questions, each at half of the level.
     changing = _cause_size(each, PER_VIEW, alpha / 2)
-    # What all views have in common comes first: large errors of that kind move points to other partners, which looks
-    # like errors of single views.
+    # Shared errors come first unless the others are clearer: large shared errors move points to other partners, which
+    # looks like errors of single views.
     alone = changing.share > 0 and changing.gain > _shared_error_gain(each)
     if alone:
         same = _cause_size(each, SHARED, alpha / 2)
     else:
-        # Without the finer ones: what is known of it where no view has errors for itself.
+        # COARSE shapes over the field, one over incidence, and the nuisance effects; finer shapes are left out.
         together = sums.merge_sides(per_view=COARSE)
         column = np.arange(together.residual.shape[1])
         coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
@@ -146,15 +151,23 @@ class _CauseSize:
 
 
 def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> _CauseSize:
-    """Return the likeliest size of errors of one cause beside the others, if it is unusual."""
+    """Return the likeliest size of errors of one cause, 0 unless it is significantly above `ALARM_SHARE`.
+
+    A likelihood ratio test at level `alpha`: the cause limited to `ALARM_SHARE` against free, the other causes free in
+    both. `over_noise` is the same test against a share of 1. Sizes are shares of the scanner's noise.
+
+    Args:
+        cause: SHARED, INCIDENCE or PER_VIEW, a number of `likelihood.design`.
+    """
 
     def clear(gain: float) -> bool:
-        # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
+        # The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         return 0.5 * chi2_tail(2 * gain, 1) < alpha
 
     shares, free = likelihood.ml_shares()
 
     def nats(share: float) -> float:
+        """Return how much log likelihood is lost if the cause has at most this share."""
         return 0.5 * (likelihood.ml_shares({cause: share})[1] - free)
 
     gain = nats(ALARM_SHARE)
@@ -164,17 +177,22 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
 
 
 def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
-    """Return the nats that errors of all views gain over usual ones where those of single views are usual."""
+    """Return the log likelihood (nats) that free shared errors gain over shared errors of at most `ALARM_SHARE`.
+
+    In both, errors of single views are at most `ALARM_SHARE`.
+    """
     usual = {PER_VIEW: ALARM_SHARE}
     both_usual = usual | {SHARED: ALARM_SHARE}
     return 0.5 * (likelihood.ml_shares(both_usual)[1] - likelihood.ml_shares(usual)[1])
 
 
 def _follows_time(errors: Array, alpha: float) -> bool:
-    """Return whether smooth errors of parts of a session trend with their order: a permutation test at level `alpha`.
+    """Return whether smooth errors of the parts of a session have a linear trend: a permutation test at level `alpha`.
+
+    The statistic is the norm of Σ order · errors over the parts.
 
     Args:
-        errors: coefficients of the errors, `COARSE` of each part (`part_of_view`), one part after the other.
+        errors: (parts · COARSE,) coefficients of the errors: `COARSE` numbers a part, the parts in the order of time.
     """
     parts = len(errors) // COARSE
     errors = errors.reshape(parts, -1)
@@ -188,15 +206,18 @@ def _follows_time(errors: Array, alpha: float) -> bool:
 def field_map(
     measurement: Measurement, sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
 ) -> FieldMap | None:
-    """Return the likeliest error, as far as the overlaps tell it; None where it is not most of what they show.
+    """Return a map of the error along the ray over the scanner's field; None where it explains too little.
+
+    It has to explain `_MIN_FIELD_SHARE` of what smooth errors leave in the overlaps. What moving the views can do (a
+    constant, slopes, a bowl) is projected out of the map.
 
     Args:
         sums: of `sum_smooth_errors` with errors of every view.
-        noise: of the scanner, length_unit.
-        nuisance: so many of the last parameters may have any size.
+        noise: of the scanner along the ray, length_unit.
+        nuisance: number of the last parameters of the sums, which may have any size.
     """
     likelihood = _coarse_fine_likelihood(sums, unconstrained, noise, nuisance)
-    # Coarse and finer errors as one cause of unit size beside incidence.
+    # Coarse and finer errors, each scaled by its likeliest size, become one cause of unit size; incidence is another.
     shares = likelihood.ml_shares()[0]
     coarse, fine, incidence = (share * columns for share, columns in zip(shares, likelihood.design, strict=True))
     sizes = np.repeat(shares[:2], [coarse.shape[1], fine.shape[1]])
@@ -212,7 +233,7 @@ def field_map(
     seen = _observed_places(measurement, x, y, forward)
     a, b = (way[seen] for way in np.meshgrid(x, y))
     rays = np.stack([a, b, np.ones_like(a)], axis=1)
-    # Coarse ones stand for what undoes the error, finer ones for the error itself.
+    # The coefficients of coarse shapes are corrections, those of finer shapes errors: hence the opposite signs.
     signs = np.where(np.arange(FINE) < COARSE, -1.0, 1.0)
     size = signs * sizes[:FINE] * noise / robust_pass_share(unconstrained.overlaps)
     shapes = np.array(legendre_products(rays * [forward, forward, 1.0], half)).T * size
@@ -227,16 +248,18 @@ def field_map(
 def _coarse_fine_likelihood(
     sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int
 ) -> SmoothErrorLikelihood:
-    """Return the likelihood of errors that all views share, by cause: coarse and finer over the field, incidence.
+    """Return the likelihood of errors that all views share, with three causes: coarse shapes, finer ones, incidence.
+
+    Coarse and finer are Legendre products over the field, of degree up to 3 and up to 6.
 
     Args:
         sums: of `sum_smooth_errors`, with errors of every view.
-        noise: rms of the sensor, length_unit.
-        nuisance: last columns of the sums, of effects that may have any size.
+        noise: rms of the sensor along the ray, length_unit.
+        nuisance: number of the last columns of the sums: effects that may have any size.
     """
     together = sums.merge_sides(per_view=COARSE)
     column = np.arange(together.residual.shape[1])
-    # The one over incidence stands after the coarse ones; it is to come last.
+    # The sums hold COARSE shapes, the one of incidence, the others, nuisance; incidence is to come before nuisance.
     order: Any = np.concatenate(
         [np.delete(column[: len(column) - nuisance], COARSE), [COARSE], column[len(column) - nuisance :]]
     )
@@ -248,7 +271,11 @@ def _coarse_fine_likelihood(
 
 
 def _field_share(likelihood: SmoothErrorLikelihood, values: Array) -> float:
-    """Return how much of what the errors (K,) leave, squared, those along the ray over the field explain."""
+    """Return the share of the errors' effect on the overlaps, as χ², that errors along the ray over the field explain.
+
+    Args:
+        values: (K,) coefficients of the first cause, of which the first FINE are along the ray over the field.
+    """
     whole = likelihood.design[0] @ values
     rest = whole - likelihood.design[0][:, :FINE] @ values[:FINE]
     squares = [float(np.sum(left**2 / likelihood.scatter)) for left in (rest, whole)]
@@ -256,9 +283,10 @@ def _field_share(likelihood: SmoothErrorLikelihood, values: Array) -> float:
 
 
 def robust_pass_share(overlaps: Overlaps) -> float:
-    """Return how much of a small error robust weights let through, as a share of what fixed weights would.
+    """Return the share of a small error that a fit with robust weights sees, over what one with fixed weights would.
 
-    They fall as the error grows: Σ dψ/de over Σ ψ/e of Tukey's ψ (Huber & Ronchetti 2009, 7.6), 0.83 for normal noise.
+    Robust weights fall as the error grows. The share is Σ dψ/de over Σ ψ/e of Tukey's ψ (Huber & Ronchetti 2009, 7.6),
+    over all correspondences: 0.83 for normal noise.
     """
     root = np.sqrt(np.concatenate([tukey(m.residual, overlaps.gram.scale) for m in overlaps.matches]))
     weight = np.concatenate([m.weight for m in overlaps.matches])
@@ -267,7 +295,12 @@ def robust_pass_share(overlaps: Overlaps) -> float:
 
 
 def _observed_places(measurement: Measurement, x: Array, y: Array, forward: float) -> Mask:
-    """Return (Y, X): True at places about which the scans have points."""
+    """Return a mask (Y, X) over the grid of the field, True where the scans have enough points.
+
+    Args:
+        x, y: (X,), (Y,) places, x/|z| and y/|z| in the scanner's frame, in equal steps.
+        forward: 1 where the scanner looks along its z axis, −1 where against it.
+    """
     edges = [np.append(at, at[-1] + at[1] - at[0]) - (at[1] - at[0]) / 2 for at in (y, x)]
     counts = np.zeros((len(y), len(x)))
     for scan in measurement.capture.scans:

@@ -99,7 +99,7 @@ class CaptureEvidence:
 
     @property
     def effect_columns(self) -> Array | None:
-        """(n, P) the effects' columns; None without effects."""
+        """(n, P) the effects' columns in the visible directions; None without effects."""
         return self.reduced_poses.reduction @ self.effect_twists if self.effect_twists.shape[1] else None
 
     @property
@@ -108,7 +108,7 @@ class CaptureEvidence:
         return self.reduced_poses.reduction @ self.common_twists
 
     def without(self, views: Indices) -> "CaptureEvidence":
-        """Return the evidence of a capture without some views, whose pairs go too."""
+        """Return the evidence without some views, given by their numbers, and without all pairs that they are in."""
         g = self.gram
         keep = np.asarray(~np.isin(g.pairs, views).any(axis=1))
         stays = ~np.isin(np.arange(g.views), views)
@@ -119,7 +119,12 @@ class CaptureEvidence:
         return replace(kept, capture=self.capture.without(views), gram=gram)
 
     def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
-        """Return Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""
+        """Return Σ w e² per correction of the robot's poses, over the pairs that `views` are in.
+
+        Args:
+            views: their numbers.
+            corrections: each (6 + P,): twist of the hand-eye, then changes of the effects' parameters.
+        """
         touched = np.isin(self.gram.pairs, views).any(axis=1)
         J = np.column_stack([hand_eye_jacobian(self.hand_eye_frames, self.gram.centre), self.effect_twists])
         moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
@@ -128,7 +133,7 @@ class CaptureEvidence:
 
 @dataclass(frozen=True)
 class RigModel:
-    """The views of all sessions of a rig: N visible directions, 6 + P unknowns."""
+    """The model z = X β + e of all sessions of a rig: N visible directions, β of hand-eye (6) and effects (P)."""
 
     parts: Sequence[CaptureEvidence]
 
@@ -144,7 +149,12 @@ class RigModel:
         return np.concatenate([np.column_stack([r.hand_eye, r.reduction @ twists]) for r, twists in reduced])
 
     def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> GeneralisedFit:
-        """Return generalised least squares under every session's scatter, with a prior (6 + P, 6 + P)."""
+        """Return generalised least squares of β (6 + P,) for z = X β + e, with cov e block-diagonal by session.
+
+        Args:
+            scatter: per session the scatter of the flange and the noise factor, which give its block of cov e.
+            prior: (6 + P, 6 + P) precision of a normal prior of β.
+        """
         noise = [
             pose_covariance(e.reduced_poses, s) + e.common_columns @ e.common_columns.T
             for e, s in zip(self.parts, scatter, strict=True)
@@ -152,7 +162,13 @@ class RigModel:
         return generalised_fit(block_diag(*noise), self.columns, prior)
 
     def mixed(self, errors: PoseErrors) -> MixedModel:
-        """Return all sessions as one block: what the arm does wrong it does wrong in all of them."""
+        """Return z = X β + e with cov e = Σ λ_i C_i as one block of all sessions, since an arm errs alike in all.
+
+        C are those of rotation scatter, translation scatter and noise, then one per pose error.
+
+        Args:
+            errors: components (6V, 6V) of the twists of all views of the rig, session after session.
+        """
         reduced = [e.reduced_poses for e in self.parts]
         white = (
             block_diag(*(r.rotation for r in reduced)),
@@ -224,35 +240,41 @@ def fit_hand_eye(
     captures: Sequence[Capture],
     unconstrained: Sequence[UnconstrainedPoses],
     T_mount: Array,
-    columns: FittedEffects | None = None,
+    effects: FittedEffects | None = None,
     scanner_errors: Mapping[str, Sequence[Array]] | None = None,
     errors: PoseErrors | None = None,
     solved: HandEyeSolution | None = None,
 ) -> HandEyeFit:
-    """Return generalised least squares over the reduced poses of all captures, covariance under all their errors.
+    """Return the hand-eye, and P parameters of effects, by generalised least squares over the views of all captures.
+
+    The estimate weighs the views by their white scatter (`solve_hand_eye`). Its covariance (6 + P, 6 + P) is then made
+    larger: the sum of what white scatter, repeating errors of the arm, errors of the scanner and unseen directions do
+    to this estimate. The first six are the right twist ξ of T_mount·exp(ξ), rad before length_unit.
 
     Args:
-        unconstrained: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
-        T_mount: (4, 4) hand-eye at which that began.
-        columns: effects to fit with it.
-        scanner_errors: by source, per capture (6V, K) twists that the views show for one sigma of each of K
-            errors that all views and captures have in common; they widen the covariance and change nothing else.
-        errors: how the poses may err beside white scatter; None: they do not. What joints do anew is not counted: on
-            average the scatter of the flange that views show holds it already.
-        solved: what `solve_hand_eye` returns of the same, if it is at hand.
+        unconstrained: per capture the views moved by the overlaps alone, and the twists from the model's poses there.
+        T_mount: (4, 4) hand-eye of these model's poses; the problem is linear about it.
+        effects: fitted together with the hand-eye; None: no effects.
+        scanner_errors: by source, per capture left twists (6V, K) that the views show for one sigma of each of K
+            errors that all views and captures have in common. They change the estimate of several scanners only.
+        errors: pose errors beside white scatter; None: there are none. Scatter of the joints is not counted twice: the
+            scatter of the flange, as estimated, contains it.
+        solved: result of `solve_hand_eye` for the same arguments, to save its time.
     """
-    # One scanner's errors move another's hand-eye, through the surfaces that both see, no more than they have to.
-    apart = any(capture.scanner is not None for capture in captures)
-    errors_of_scanners = list((scanner_errors or {}).values()) if apart else []
-    common = [np.hstack(of_capture) for of_capture in zip(*errors_of_scanners, strict=True)]
-    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, columns, common)
+    # Through surfaces that two scanners see, the errors of one would move the hand-eye of the other. Such views weigh
+    # less if the errors are in the covariance of the estimate too.
+    several_scanners = any(capture.scanner is not None for capture in captures)
+    errors_by_source = list((scanner_errors or {}).values()) if several_scanners else []
+    common = [np.hstack(of_capture) for of_capture in zip(*errors_by_source, strict=True)]
+    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, effects, common)
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
     repeating = errors.restricted(errors.causes - {JOINT_SCATTER})
     sources = _variance_sources(solution, repeating, scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
+    # The inflation is the geometric mean, over the 6 + P parameters, of the ratio of this covariance to the estimate's.
     log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(solution.gls.covariance)[1]
     visible = covariance[:6].copy()
-    # Held where they are, the hidden directions are no better known than before.
+    # Directions that no motion shows were fixed in the fit: their variance is that of the weak prior.
     sources["unseen"][:6, :6] += solution.hidden @ solution.hidden.T
     covariance[:6, :6] += solution.hidden @ solution.hidden.T
     return HandEyeFit(
@@ -273,10 +295,18 @@ def fit_hand_eye(
 def _variance_sources(
     solution: HandEyeSolution, errors: PoseErrors, scanner_errors: Mapping[str, Sequence[Array]]
 ) -> dict[str, Array]:
-    """Return what each source does to the covariance (6 + P, 6 + P)."""
+    """Return by name of the source its part (6 + P, 6 + P) of the covariance of the estimate β = G z: G C Gᵀ.
+
+    C is the covariance that the source gives z. That of scatter and of pose errors has a variance fitted here; that of
+    the scanner's errors follows from their twists. "unseen" is what the prior of β leaves where z says nothing.
+
+    Args:
+        errors: pose errors beside white scatter, of all views of the rig.
+        scanner_errors: by source, per capture left twists (6V, K) of the views for one sigma of each of K errors.
+    """
     rig, gls = solution.rig, solution.gls
     mixed = rig.mixed(errors)
-    # White scatter alone was found with the answer.
+    # Of white scatter alone the solution has the variances already: the fit begins there.
     start = None if errors.names else solution.scatter[0].variances
     fit = fit_variances(mixed, start=start, both_starts=True)
     mean = fit.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, fit)
@@ -285,19 +315,24 @@ def _variance_sources(
     for name, twists in scanner_errors.items():
         columns = rig.reduce(twists)
         repeated = gls.gain @ columns
+        # One scanner's scale shows in the views themselves: it is known better than by its sigma, or is off by more.
         if name == SCANNER_SCALE and not rig.parts[0].common_twists.size:
             scatter = np.einsum("c,cij->ij", mean, mixed.components[:, 0])
             repeated = repeated @ _posterior_root(rig, scatter, columns)
         sources[name] = repeated @ repeated.T
-    # The rest is what the prior leaves where nothing is seen.
     sources["unseen"] = gls.covariance @ solution.prior @ gls.covariance
     return sources
 
 
 def _posterior_root(rig: RigModel, scatter: Array, errors: Array) -> Array:
-    """Return the square root (K, K) of what the views leave of errors (N, K) of unit size: variance with squared mean.
+    """Return a root L (K, K) of E[θ θᵀ] = L Lᵀ, for K errors θ of the scanner after the views were seen.
 
-    Long ways of the flange show how long the scanner's millimetre is, short ones do not.
+    z = X β + F θ + e with θ ~ N(0, 1) a priori. L Lᵀ is the posterior variance of θ plus its squared mean: the hand-eye
+    is not corrected by that mean. Long travel of the flange shows the scanner's scale, short travel does not.
+
+    Args:
+        scatter: (N, N) covariance of e.
+        errors: F (N, K), visible directions per sigma of each error.
     """
     white = np.linalg.solve(np.linalg.cholesky(scatter), np.column_stack([rig.columns, errors, rig.z]))
     free = project_out(white[:, : rig.columns.shape[1]], white[:, rig.columns.shape[1] :])
@@ -314,7 +349,10 @@ def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
 
 
 def _heldout_ratio(solution: HandEyeSolution) -> float:
-    """Return the rms of views left out in groups over that of the same pairs under the estimates of all views."""
+    """Return the rms residual of views left out of the fit over the rms of the same pairs when they are in it.
+
+    Views are left out in groups, one group at a time; NaN where there is none. Scatter is not estimated again.
+    """
     parts = list(zip(solution.rig.parts, solution.scatter, strict=True))
     outside = np.zeros(2)
     for k, (e, scatter) in enumerate(parts):
@@ -333,25 +371,35 @@ def solve_hand_eye(
     captures: Sequence[Capture],
     unconstrained: Sequence[UnconstrainedPoses],
     T_mount: Array,
-    columns: FittedEffects | None = None,
+    effects: FittedEffects | None = None,
     common: Sequence[Array] = (),
 ) -> HandEyeSolution:
-    """Return the answer in which views weigh by the scatter that they show, and by errors that they have in `common`,
-    (6V, K) a capture; other arguments as of `fit_hand_eye`."""
+    """Return the estimate of hand-eye and effects by generalised least squares; `fit_hand_eye` adds its covariance.
+
+    Views weigh by the scatter of the flange that each capture shows (REML). A weak prior keeps unseen directions small.
+
+    Args:
+        unconstrained: per capture the views moved by the overlaps alone, and the twists from the model's poses there.
+        T_mount: (4, 4) hand-eye of these model's poses; the problem is linear about it.
+        effects: fitted together with the hand-eye; None: no effects.
+        common: per capture left twists (6V, K) of the views per sigma of K further errors, counted in the covariance
+            of the observations; (): there are none.
+    """
     none = tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained)
-    if columns is None:
-        columns = FittedEffects(none, np.zeros(0), np.zeros(0))
+    if effects is None:
+        effects = FittedEffects(none, np.zeros(0), np.zeros(0))
     parts = [
         CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), twists, shared)
-        for c, f, twists, shared in zip(captures, unconstrained, columns.twists, common or none, strict=True)
+        for c, f, twists, shared in zip(captures, unconstrained, effects.twists, common or none, strict=True)
     ]
     rig = RigModel(parts)
     scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns, e.common_columns) for e in parts)
-    prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
+    prior = weak_prior(captures, unconstrained, T_mount, effects.prior)
     hidden = _hidden_twists(captures, T_mount, prior)
-    # What the motions do not show stays where it is.
+    # A huge precision fixes the directions that the motions do not show.
     prior[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
-    prior_vector = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
+    # The prior of the effects is about the value 0, the unknowns are changes from `effects.values`.
+    prior_vector = np.concatenate([np.zeros(6), -effects.values * effects.prior**-2.0])
     gls = rig.fit_gls(scatter, prior)
     x = gls.solve(rig.z, prior_vector)
     return HandEyeSolution(
@@ -361,7 +409,7 @@ def solve_hand_eye(
         prior_vector=prior_vector,
         gls=gls,
         x=x,
-        values=columns.values,
+        values=effects.values,
         hidden=hidden,
         T_mount=T_mount @ frames.exp(x[:6]),
     )
@@ -385,10 +433,13 @@ def step_hand_eye(
 def weak_prior(
     captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array, effects: Array
 ) -> Array:
-    """Return a precision (6 + P, 6 + P): one radian and one working distance keep the unseen finite, move nothing else.
+    """Return the precision (6 + P, 6 + P) of a prior so weak that it decides only what the views do not show.
+
+    Its σ are 1 rad for the hand-eye's rotation, the median distance from scanner to part for its translation.
 
     Args:
-        effects: (P,) standard deviations of the prior of effects fitted with the hand-eye.
+        T_mount: (4, 4) maps scanner to mount.
+        effects: (P,) σ of the prior of the effects' parameters, in their units.
     """
     ranges = [
         np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
@@ -404,28 +455,32 @@ def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
 
 
 def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Capture) -> ReducedPoses:
-    """Return per-view twists reduced to the directions that the overlaps see.
+    """Return the twists of all views reduced to the n directions that the overlaps see, z = R δ, with X and Σ of z.
+
+    X is the response to the hand-eye, the covariances are those of a unit scatter of the flange and of the noise.
 
     Args:
-        g: normal equations about the part's centre, at the free-network poses.
-        twists: (V, 6) about that centre, from the model's poses to those.
-        hand_eye_frames: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
-        capture: says how a twist of the flange shows in each view, and which views share one.
+        g: normal equations at the poses that the overlaps alone determine, about the part's centre.
+        twists: δ (V, 6), left twists about that centre from the model's poses to those, rad and length_unit.
+        hand_eye_frames: (V, 4, 4), T_reference_mount·T_mount: their adjoint carries a right twist of the hand-eye into
+            the reference frame.
+        capture: poses of the flange, and which views were scanned at one stop and share its scatter.
     """
     seen = g.visible
-    left = seen.vectors.T / seen.scale
+    reduction = seen.vectors.T / seen.scale
     to_centre = frames.make(np.eye(3), -g.centre)
-    response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
+    response = reduction @ hand_eye_jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ capture.T_reference_flange)
-    # Covariances of the visible directions for independent unit turns and shifts of the flange at every stop.
-    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
+    # (V, n, 6) visible directions per unit rotation and translation of the flange in each view.
+    blocks = reduction.reshape(len(reduction), -1, 6).transpose(1, 0, 2) @ carried
     if capture.stop is not None:
+        # One scatter a stop, not one a view.
         of_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
         np.add.at(blocks, capture.stop, of_view)
     return ReducedPoses(
-        reduction=left,
+        reduction=reduction,
         expansion=seen.scale[:, None] * seen.vectors,
-        z=left @ twists.reshape(-1),
+        z=reduction @ twists.reshape(-1),
         hand_eye=response,
         rotation=summed_squares(blocks[..., :3]),
         translation=summed_squares(blocks[..., 3:]),
@@ -448,10 +503,15 @@ def mean_basis(columns: Array) -> Array:
 def estimate_repeatability(
     reduced: ReducedPoses, further: Array | None = None, common: Array | None = None
 ) -> Repeatability:
-    """Return REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean.
+    """Return the scatter of the flange by restricted maximum likelihood (REML): σ_r (rad), σ_t (length_unit), c.
+
+    z = X β + e with cov e = σ_r² C_r + σ_t² C_t + c C_n + B Bᵀ. c is the factor on the noise within overlaps, whose
+    errors are correlated. β is free: X are the responses to the hand-eye and the `further` columns.
 
     Args:
-        common: (n, K) beside the scatter, of unit variance each.
+        reduced: z (n,), its response to the hand-eye and C_r, C_t, C_n (n, n).
+        further: (n, K) more columns of X, those of effects; None: the hand-eye alone.
+        common: B (n, K), errors of unit variance that are known to be there; None: none.
     """
     mixed = hand_eye_mixed_model(reduced, further)
     if common is not None and common.size:
@@ -476,12 +536,16 @@ def pose_covariance(reduced: ReducedPoses, scatter: Repeatability) -> Array:
 def whiten_captures(
     sessions: Sequence[tuple[Capture, UnconstrainedPoses, Array]], T_mount: Array, values: Array, free: Mask
 ) -> WhitenedData:
-    """Return all captures of a rig in units of their pose scatter, stacked.
+    """Return columns of the hand-eye, columns of P effects, and observations of all captures, whitened and stacked.
+
+    Each capture is whitened by the covariance of its own pose scatter.
 
     Args:
-        sessions: per capture its free-network views and the twists (6V, P) of the effects.
-        values: (P,) of the effects at which the views were moved; z is what was seen without them.
-        free: (P,) effects that explain scatter.
+        sessions: per capture the views moved by the overlaps alone, and their left twists (6V, P) per unit of each
+            parameter of the effects.
+        T_mount: (4, 4) maps scanner to mount.
+        values: (P,) of the parameters when the views were moved; their effect is added to the observations again.
+        free: (P,) True for parameters that are free while the scatter is estimated.
     """
     stacked = []
     for capture, views, twists in sessions:

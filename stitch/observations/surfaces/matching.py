@@ -43,7 +43,13 @@ def sample_points(scan: Scan, count: int) -> Indices:
 
 
 def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
-    """Return the pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
+    """Return the pairs (v < w) of scans whose boxes come within `gate`, length_unit: no others can correspond.
+
+    The boxes are those of the scans in their own frames, placed by `poses` and boxed again along the reference axes.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+    """
     placed = [frames.transform(T, box_corners(scan.box)) for scan, T in zip(scans, poses, strict=True)]
     low, high = np.min(placed, axis=1), np.max(placed, axis=1)
     apart = (low[:, None] - high[None] > gate).any(axis=2)
@@ -63,6 +69,7 @@ def overlapping_pairs(
     queries = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
     near = near_pairs(scans, poses, gate)
     one = overlap_shares(queries, near, gate)
+    # A small view inside a large one: few of the large one's points meet, but most of the small one's do.
     other = overlap_shares(queries, [(w, v) for v, w in near if one[v, w] < MINIMUM_OVERLAP], gate)
     return [(v, w) for v, w in near if max(one[v, w], other.get((w, v), 0.0)) >= MINIMUM_OVERLAP]
 
@@ -70,13 +77,21 @@ def overlapping_pairs(
 def overlap_shares(
     queries: "NeighbourQueries", pairs: Sequence[tuple[int, int]], gate: float
 ) -> dict[tuple[int, int], float]:
-    """Return by pair (asking, asked) the share of the first view's points that find a partner in the second."""
+    """Return by pair (v, w) the share of view v's points that find a partner in view w.
+
+    A partner is the nearest point within `gate` (length_unit) whose normal differs by at most 45°.
+
+    Args:
+        queries: points of all views that are searched.
+        pairs: ordered pairs (v, w).
+    """
+    # All that ask one view are searched in its tree at once; the views in parallel.
     asking = defaultdict[int, list[int]](list)
     for v, w in pairs:
         asking[w].append(v)
 
     def meeting(asked: tuple[int, list[int]]) -> list[float]:
-        """Return for each view that asks one view, (w, views), the share of its points that find a partner there."""
+        """Return, for `asked` = (w, views), the share of each of these views' points that find a partner in view w."""
         w, views = asked
         parts = [(v, slice(None)) for v in views]
         _, points, normals = queries.gather(parts)
@@ -134,18 +149,19 @@ class Searched:
     def still_open(
         self, queries: "NeighbourQueries", parts: list[list[QueryPart]], gate: float
     ) -> list[Indices] | None:
-        """Return per view asked which of its queries (indices) may have another partner under new poses.
+        """Return per view searched the numbers of the queries whose nearest point may be another under new poses.
 
-        A distance changes by no more than the motion of the point that asks, seen from the view that is asked: a
-        partner that leads by more than twice that motion is still the nearest.
+        A distance to a point of a view changes by no more than the query moves, seen from that view. So the nearest
+        point is the same while its lead over the second is more than twice that motion.
 
         Args:
-            queries: of the same points under the new poses.
-            parts: per view those that ask it.
-            gate: largest distance between partners, length_unit.
+            queries: the same points under the new poses.
+            parts: per view searched, which points of which views are searched in it.
+            gate: largest distance between corresponding points, length_unit.
 
         Returns:
-            None where all have to ask anew: other points, a larger gate, or motions that leave little known.
+            None where all queries are to be searched: other points, a larger gate, motion beyond what was searched
+            (`_REACH`), or more than `_MOST_OPEN` of the queries open.
         """
         before = self.queries
         if gate > self.gate or parts != self.parts or len(queries.scans) != len(before.scans):
@@ -157,7 +173,7 @@ class Searched:
         out, total = list[Indices](), 0
         for w, (asking, nearest) in enumerate(zip(parts, self.nearest, strict=True)):
             v = [view for view, _ in asking]
-            # A point between the corners moves no more than one of them.
+            # A point inside a box moves no more than one of its corners.
             was = frames.transform(frames.inverse(before.poses[w]) @ before.poses[v], corners[v])
             now = frames.transform(frames.inverse(queries.poses[w]) @ queries.poses[v], corners[v])
             moved = np.linalg.norm(now - was, axis=2).max(axis=1)
@@ -177,17 +193,19 @@ def match_pairs(
     before: Searched | None = None,
     turns: Indices | None = None,
 ) -> tuple[list[Match], Searched]:
-    """Return the correspondences of `pairs`, each sampled point with its nearest point of the other, and the search.
+    """Return the correspondences of each pair of views that has some, and the search, for the next call's `before`.
 
-    Where a view overlaps with more than 20 others, its points take turns: each is asked for in 20 of them. What a point
-    says of its own view it says to the first few already, so that many views cost what they are and not their square.
+    Each sampled point is matched with the nearest usable point of the other view, in both directions. With t turns,
+    every t-th point of a view is searched in each other view, different points in different views: so the cost grows
+    with the number of views, not with its square.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
-        gate: largest distance between partners, length_unit.
-        samples: per view the indices that search (see `sample_points`).
-        before: a search under other poses; what cannot have changed since then is not looked for again.
-        turns: (V,) among how many points of a view they take turns, where that is known (`partners.py`).
+        pairs: (v, w) to match.
+        gate: largest distance between corresponding points, length_unit.
+        samples: per view the numbers of the points that are searched (see `sample_points`).
+        before: a search under other poses: nearest points that cannot have changed are taken from it. None: all anew.
+        turns: (V,) t of each view; None: as many as make a point be searched in about `_MOST_PARTNERS` views.
     """
     if turns is None:
         turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
@@ -199,7 +217,7 @@ def match_pairs(
     again = None if before is None else before.still_open(queries, parts, gate)
 
     def search_view(w: int) -> tuple[Nearest, dict[int, Match]]:
-        """Return what is nearest in one view, and by view that asks what of it lies within the gate."""
+        """Return the nearest points in view w of all queries, and by querying view the matches within the gate."""
         if not parts[w]:
             return Nearest(np.zeros(0, np.int32), np.zeros(0, np.float32)), {}
         index, points, normals = queries.gather(parts[w])
@@ -220,6 +238,7 @@ def match_pairs(
             columns = zip(*(match.columns for match in both), strict=True)
             matches.append(Match(v, w, *(np.concatenate(column) for column in columns)))
     if before is None or again is None:
+        # Points and normals under these poses are not needed again: the next search has its own.
         lean = replace(queries, poses=np.array(poses), points=[], normals=[])
         before = Searched(lean, parts, gate, list(nearest))
     return matches, before
@@ -233,11 +252,13 @@ def _partners_by_view(
     nearest: NDArray[np.int32],
     asking: tuple[Indices, Array, Array],
 ) -> dict[int, Match]:
-    """Return per view v that asks what its points found in view w within the gate: all that ask one view at once.
+    """Return by view v its matches in view w: pairs of points within the gate whose normals differ by less than 45°.
 
     Args:
-        nearest: (N,) points of view w, -1 where there is none.
-        asking: index, point and normal of all that ask, in the order of `parts`.
+        parts: which points of which views were searched in view w.
+        gate: largest distance between corresponding points, length_unit.
+        nearest: (N,) number of the nearest point of view w for each query, -1 where there is none.
+        asking: number (N,), point and normal (N, 3), reference frame, of each query, in the order of `parts`.
     """
     scan, T = queries.scans[w], queries.poses[w]
     some = np.flatnonzero(nearest >= 0)
@@ -290,11 +311,18 @@ class NeighbourQueries:
         return [len(range(*at.indices(len(self.index[v])))) for v, at in parts]
 
     def nearest(self, w: int, points: Array, gate: float) -> Nearest:
-        """Return what points (N, 3) of the reference frame find in view w, and how certain it is after motion."""
+        """Return the point of view w nearest to each of N points, and its lead: for how much motion it stays nearest.
+
+        While a query moves by less than half of the lead, no other point comes nearer within the gate (`Nearest`).
+
+        Args:
+            points: (N, 3) reference frame.
+            gate: largest distance between corresponding points, length_unit.
+        """
         tree, reach = self.scans[w].tree, _REACH * gate
         distance, index = tree.query(self._seen_from(w, points), k=min(2, tree.n), distance_upper_bound=reach)
         first, second = distance.reshape(len(points), -1).T[[0, -1]]
-        # What is beyond the gate anyway has to come all the way back.
+        # A point beyond the gate has no partner until it has moved back into it.
         lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
         return Nearest(self._usable(w, index.reshape(len(points), -1)[:, 0]), lead.astype(np.float32))
 
@@ -303,12 +331,14 @@ class NeighbourQueries:
         return self._usable(w, self.scans[w].tree.query(self._seen_from(w, points), distance_upper_bound=gate)[1])
 
     def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Return of N points each (N,): distance (inf where none), and whether the partner may be used.
+        """Return two (N,): the distance of each point to view w (inf beyond the gate), and whether it has a partner.
+
+        The nearest point is a partner if it is usable and its normal differs by less than 45°.
 
         Args:
             w: the view in which partners are sought.
             points, normals: (N, 3) reference frame.
-            gate: farthest partner, length_unit.
+            gate: largest distance between corresponding points, length_unit.
         """
         scan = self.scans[w]
         distance, index = scan.tree.query(self._seen_from(w, points), distance_upper_bound=gate)
@@ -337,11 +367,14 @@ def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Ind
 
 
 def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
-    """Return signed distances (M,) of all correspondences, v less w along their normals, with the views elsewhere.
+    """Return signed distances (M,) of all correspondences, (p_v − p_w)·n in length_unit, at other poses of the views.
+
+    The correspondences and their normals n are those of the matches.
 
     Args:
+        matches: M correspondences in all.
         poses: T_reference_scanner, (V, 4, 4).
-        points: (N, 3) of every scan, scanner frame.
+        points: per scan (N, 3), scanner frame.
     """
     placed = [frames.transform(T, in_scanner) for T, in_scanner in zip(poses, points, strict=True)]
     distances = []

@@ -85,11 +85,14 @@ def collect_overlaps(
     samples: Sequence[Indices],
     before: Overlaps | None = None,
 ) -> Overlaps:
-    """Return all overlapping pairs matched within `gate`, with their normal equations.
+    """Return the correspondences of all overlapping pairs of views, and of common targets, with their normal equations.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
-        before: of an iteration before; its pairs and its search serve again where little has moved since then.
+        gate: largest distance between corresponding points, length_unit.
+        samples: per view the numbers of the points that are searched in other views.
+        before: of an earlier iteration. Its pairs, and the nearest points that cannot have changed, are used again
+            while the views have moved little; None: all is searched.
 
     Raises:
         NoResultError: no two views overlap.
@@ -115,7 +118,15 @@ def collect_overlaps(
 
 
 def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
-    """Return whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
+    """Return whether the pairs of `before` still hold: views and gate have changed by less than `_SAME_PAIRS` gates.
+
+    Both are counted since the pairs were searched. A gate below `_SMALLER_GATE` of that one needs a new search, since
+    too many pairs would be kept.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+        gate: largest distance between corresponding points, length_unit.
+    """
     assert before.probed is not None
     T, probed_gate = before.probed
     if gate < _SMALLER_GATE * probed_gate:
@@ -127,11 +138,14 @@ def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
 
 
 def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Array) -> Overlaps:
-    """Return the same correspondences after views have moved by so little that their partners stay: e + B(δ_v − δ_w).
+    """Return the overlaps with the same correspondences after a small motion of the views, without a search.
+
+    The residual e of a correspondence becomes e + B (δ_v − δ_w), to first order in the left twists δ of its views.
 
     Args:
-        start: (V, 4, 4) T_reference_scanner under which they were matched.
-        poses: (V, 4, 4) where the views are now.
+        before: overlaps at `start`.
+        start: (V, 4, 4) T_reference_scanner under which the points were matched.
+        poses: (V, 4, 4) T_reference_scanner after the motion.
     """
     centre = before.gram.centre
     to_centre = frames.make(np.eye(3), -centre)
@@ -146,10 +160,12 @@ def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Arra
 
 
 def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
-    """Return per view the points that ask where all views say one thing: of many views each needs fewer.
+    """Return per view the numbers of the points that are searched in others: at most `_TOTAL_SAMPLES` in all views.
+
+    For estimates of few numbers from all views together, as a hand-eye: of many views each needs fewer points.
 
     Args:
-        most: of one view.
+        most: largest number of points of one view.
     """
     return [sample_points(scan, min(most, _TOTAL_SAMPLES // len(scans))) for scan in scans]
 
@@ -209,7 +225,11 @@ class Gram:
 
     @cached_property
     def visible(self) -> VisibleDirections:
-        """What overlaps and common targets see of the views' twists; eigenvectors of thousands of rows, found once."""
+        """Directions of the views' twists that overlaps and common targets see: eigenvectors of H, found once.
+
+        Twists are scaled to displacements. Directions whose eigenvalue is below `NEAR_NULL` of the largest are not seen
+        by surfaces. Targets add directions of their own; within the sum H is diagonalised again.
+        """
         scale = np.tile(1 / self.displacement_factors, self.views)
         values, vectors = np.linalg.eigh(assemble(self, ~self.labelled)[0] * scale[:, None] * scale)
         keep = values > NEAR_NULL * values[-1]
@@ -220,7 +240,7 @@ class Gram:
         targets = assemble(self, self.labelled)[0] * scale[:, None] * scale
         basis = np.hstack([seen, _target_only_directions(targets, seen)])
         values, within = np.linalg.eigh(basis.T @ ((seen * values) @ seen.T + targets) @ basis)
-        # Beside surfaces, points of a huge sigma leave rounding, which has either sign.
+        # Targets of a huge sigma leave eigenvalues that are rounding, of either sign.
         held = values > _ROUNDING * values[-1]
         return VisibleDirections(values[held], basis @ within[:, held], scale, seen)
 
@@ -235,9 +255,14 @@ class Gram:
 
 
 def _target_only_directions(H: Array, vectors: Array) -> Array:
-    """Return (6V, k), orthonormal: what targets see where surfaces, `vectors` (6V, n), see nothing.
+    """Return an orthonormal basis (6V, k) of the scaled twists that targets see and surfaces do not.
 
-    A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
+    Eigenvalues below `_NULL` of the largest count as not seen. They occur where a target is the centre of the ball that
+    is the surface: both centres differ by noise only, and so does what a rotation of the ball does.
+
+    Args:
+        H: (6V, 6V) normal matrix of the targets, scaled.
+        vectors: (6V, n) orthonormal basis of what surfaces see.
     """
     unseen = np.linalg.svd(vectors, full_matrices=True)[0][:, vectors.shape[1] :]
     if not unseen.shape[1]:
@@ -261,10 +286,16 @@ def sum_matches(matches: Sequence[Match], views: int) -> Gram:
 def gram(
     matches: Sequence[Match], views: int, centre: Array, scale: float, weights: Sequence[Array] | None = None
 ) -> Gram:
-    """Return the sums over pairs; Tukey weights at `scale` unless `weights` gives them per match, (M,) each.
+    """Return per pair of views the sums Σ w BᵀB, Σ w Bᵀe, Σ w e², Σ w over its correspondences, with e and B.
+
+    e is the signed distance of a correspondence, B its row [m × n, n] per left twist of a view about `centre`.
 
     Args:
-        centre: (3,) about which twists of the views count, reference frame.
+        matches: one per pair of views.
+        views: their number V.
+        centre: (3,) reference frame.
+        scale: robust sigma of e, length_unit, at which Tukey's weights fall and residuals are cut (`RMS_GATE`).
+        weights: (M,) per match, instead of the match's own weights times Tukey's; None: these.
     """
     rows = []
     for i, m in enumerate(matches):
@@ -289,7 +320,13 @@ def gram(
 
 
 def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
-    """Return H (6V, 6V) and b (6V,) of all pairs: the cost is ½ δᵀHδ + bᵀδ; `keep` masks pairs."""
+    """Return H (6V, 6V) and b (6V,) of the quadratic cost ½ δᵀHδ + bᵀδ in the left twists δ of all views.
+
+    A pair (v, w) counts δ_v − δ_w: its matrix is added to the blocks vv and ww, and subtracted from vw and wv.
+
+    Args:
+        keep: (P,) bool, the pairs that count; None: all.
+    """
     H = np.zeros((g.views, 6, g.views, 6))
     b = np.zeros((g.views, 6))
     for i, (v, w) in enumerate(g.pairs):
@@ -306,7 +343,7 @@ def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
 
 
 def pair_squares(g: Gram, twists: Array) -> Array:
-    """Return Σ w e² of every pair (P,) after the views moved by `twists` (V, 6), without new matches."""
+    """Return Σ w e² of every pair (P,) after the views moved by left twists (V, 6), without new correspondences."""
     difference = twists[g.pairs[:, 0]] - twists[g.pairs[:, 1]]
     linear = np.einsum("pi,pi->p", g.vector, difference)
     quadratic = np.einsum("pi,pij,pj->p", difference, g.matrix, difference)
@@ -330,7 +367,10 @@ class TargetPairs:
 
 
 def target_pairs(sightings: Sightings, poses: Array) -> TargetPairs | None:
-    """Return all pairs of views that see a common target; None without any.
+    """Return one row per target and pair of views that both see it; None where no two views see the same target.
+
+    The n views that see a target make n(n − 1)/2 rows: eliminating its unknown place leaves exactly their differences,
+    weighted by w_v w_w / Σw with w = 1/σ² (see the head of this file).
 
     Args:
         poses: T_reference_scanner (V, 4, 4).
@@ -352,11 +392,16 @@ def target_pairs(sightings: Sightings, poses: Array) -> TargetPairs | None:
 
 
 def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
-    """Return the sums of the surfaces, followed by those of the labelled points in the same unit of variance.
+    """Return the sums of the surfaces' pairs, followed by those of pairs of views with common targets.
+
+    Targets are weighted by 1/σ², surfaces by weights near 1. Targets are brought to the unit of the surfaces: times the
+    variance of a distance between surfaces, `noise_factor` · `g.variance`.
 
     Args:
-        noise_factor: what a distance between surfaces varies by is `noise_factor` times `g.variance`: its
-            correspondences share points, normals and the scanner's own field.
+        g: sums of surfaces alone.
+        targets: None: there are none, `g` is returned.
+        noise_factor: variance between surfaces over that of independent distances. It exceeds 1, since correspondences
+            share points, normals and the scanner's smooth errors.
     """
     if targets is None:
         return g
@@ -380,7 +425,7 @@ def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) ->
 
 
 def sum_by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:
-    """Return pairs of views (P, 2), and rows (N, ...) summed over all targets that the two have in common, (P, ...)."""
+    """Return the different pairs of views (P, 2) of N rows, and per pair the sum of its rows (N, …): (P, …)."""
     pairs, number = np.unique(targets.views, axis=0, return_inverse=True)
     out = np.zeros((len(pairs), *rows.shape[1:]))
     np.add.at(out, number.reshape(-1), rows)

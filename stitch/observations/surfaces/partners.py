@@ -40,14 +40,15 @@ _FOUND, _MORE_POINTS = 5.5, 1.3
 def find_partners(
     scans: Sequence[Scan], poses: Array, gate: float, at_most: int
 ) -> tuple[list[tuple[int, int]], Indices | None]:
-    """Return the pairs (v < w) that are matched, and (V,) among how many points of a view they take turns.
+    """Return the pairs of views (v < w) whose points are matched, and the number of turns (V,) of each view.
 
-    Of few views these are all that overlap, and None: as many turns as `match_pairs` finds.
+    With t turns every t-th point of a view is searched in each partner, the partners taking different points. Of up to
+    `_ALL_PARTNERS` views the pairs are all that overlap, and the turns None: `match_pairs` then chooses them.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
-        gate: largest distance between partners, length_unit.
-        at_most: points of a view that are probed.
+        gate: largest distance between corresponding points, length_unit.
+        at_most: points of a view that are probed for overlap.
     """
     if len(scans) <= _ALL_PARTNERS:
         return overlapping_pairs(scans, poses, gate, at_most), None
@@ -63,7 +64,12 @@ def find_partners(
 
 
 def more_points(scans: Sequence[Scan], samples: Sequence[Indices], turns: Indices) -> list[Indices]:
-    """Return per view the points that ask: more than `samples` where they take turns among partners."""
+    """Return per view the numbers of the points that are searched: `_MORE_POINTS` times as many where turns are taken.
+
+    Args:
+        samples: per view the numbers of its points without turns.
+        turns: (V,) as `find_partners` returns them; 1: every point is searched in every partner.
+    """
     return [
         sample_points(scan, round(_MORE_POINTS * len(index))) if turn > 1 else index
         for scan, index, turn in zip(scans, samples, turns, strict=True)
@@ -71,13 +77,14 @@ def more_points(scans: Sequence[Scan], samples: Sequence[Indices], turns: Indice
 
 
 def _best_of(shares: Array, meet: Mask) -> Mask:
-    """Return which pairs (V, V) are matched, of those that meet: without which the views would hang together less.
+    """Return a symmetric mask (V, V) of the pairs to match, among those that overlap.
 
-    And of each view the pairs that show most of each other, and some spread over the others.
+    Kept are pairs that other ways through the views cannot stand in for (`_IRREPLACEABLE`), of each view the `_BEST`
+    partners of largest shares, and `_SPREAD` more, evenly over the rest in the order of shares.
 
     Args:
-        shares: (V, V) what both views of a pair show of each other.
-        meet: (V, V) pairs that overlap.
+        shares: (V, V) symmetric: share of the first view's points found in the second, plus the other way round.
+        meet: (V, V) True for pairs that overlap.
     """
     kept = meet & (_leverage(np.where(meet, shares, 0.0)) > _IRREPLACEABLE)
     for v, of_view in enumerate(meet):

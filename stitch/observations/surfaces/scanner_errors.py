@@ -60,9 +60,10 @@ _MAX_PARTS = 30
 def rig_scanner_errors(
     measurements: Sequence[Measurement], unconstrained: Sequence[UnconstrainedPoses]
 ) -> dict[str, list[Array]]:
-    """Return by source, per session of a rig, twists (6V, K) of the views by errors that all views have in common.
+    """Return, by source and per session of a rig, left twists (6V, K) of the views by errors that all views share.
 
-    They are those of one standard deviation; the errors over the field are as large as each session shows them.
+    Sources are the scanner's field and its scale; a column is one standard deviation of one error. The size of errors
+    over the field is estimated from each session, that of the scale is `SCALE_SIGMA`.
     """
     sessions = list(zip(measurements, unconstrained, strict=True))
     return {
@@ -74,10 +75,13 @@ def rig_scanner_errors(
 def field_scatter(
     measurement: Measurement, unconstrained: UnconstrainedPoses, share: float | None = ALARM_SHARE
 ) -> Array:
-    """Return twists (6V, K) that the views show for one standard deviation of each of K independent smooth errors.
+    """Return left twists (6V, K) that the views show for one standard deviation of each of K smooth errors.
+
+    The errors are independent, along the ray, over the field and over incidence, alike in all views of a scanner.
+    Several scanners have K columns together, each its own; zeros where the scans are too few for a noise.
 
     Args:
-        share: rms of the errors over the scanner's noise; None takes it from what the overlaps show.
+        share: rms of the errors as a share of the scanner's noise; None: estimated from the overlaps.
     """
     every = []
     for views in measurement.views.scanners.masks(measurement.views.count):
@@ -95,18 +99,19 @@ def field_scatter(
 
 
 def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -> Array:
-    """Return twists (6V, K) that the views show for one standard deviation of each scanner's scale; none of a tracker.
+    """Return left twists (6V, K) that the views show for one standard deviation of the scale of each of K scanners.
 
-    Scans that are all too large by the same share still fit each other, each moved along the way from the part to its
-    scanner: so no overlap shows the scale, but the ways of the arm do. An arm whose lengths are all too short looks so.
-    Scans of scanners that differ do not fit, and how each pair then comes to rest hangs on where it overlaps.
+    A tracker or probe has no optics whose scale could be off: one column of zeros.
     """
     if not measurement.has_optics:
         return np.zeros((6 * len(unconstrained.poses), 1))
     scanners = measurement.views.scanners
     if not scanners:
+        # Scans too large by the same share still fit each other, each shifted along the line from the part to its
+        # scanner. So the twists are known without sums over correspondences.
         away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
         return SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1)
+    # Scans of two scanners with different scales do not fit: where each comes to rest depends on where they overlap.
     capture = measurement.capture
     is_own = np.array(scanners.masks(len(capture.scans)))
 
@@ -128,14 +133,17 @@ def sum_smooth_errors(
     per_view: bool = False,
     views: Mask | None = None,
 ) -> tuple[PointGram, float]:
-    """Return sums of smooth errors of unit size, then of what is beside them, and the noise; NaN without scans.
+    """Return the sums over pairs for parameters of smooth errors, and the median noise of the scans, length_unit.
 
-    The first are COARSE, along the ray over the field, and one over incidence.
+    The parameters are, in this order: `COARSE` shapes along the ray over the field, one over incidence, and those of
+    `point_effects`. Each counts what undoes the error, per unit. The noise is NaN if no scan is large enough for one.
 
     Args:
-        per_view: those of COARSE for either view of a pair its own; and after the one over incidence what all views may
-            have in common besides.
-        views: (V,) bool, those of one scanner, which alone has the errors; None: all.
+        point_effects: further effects that move points; None: none.
+        per_view: True: each of the COARSE shapes has a coefficient of its own in each view, so that the sums hold them
+            twice (`stream_point_sums`); and after incidence come further shapes that all views share
+            (`_shared_shapes`).
+        views: (V,) bool, the views of the one scanner that has the errors; None: all have them.
     """
     capture = measurement.capture
     own = np.ones(len(unconstrained.poses), bool) if views is None else views
@@ -145,10 +153,12 @@ def sum_smooth_errors(
     standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in scans])))
 
     def corrections(away: Array, cosine: Array) -> Array:
+        """Return how unit parameters move points (K, N, 3) on rays (N, 3) from the eye, of incidence cosine (N,)."""
         corrected = smooth_corrections(away, cosine, half)
         return np.concatenate([corrected, _shared_shapes(away, half, standoff)]) if per_view else corrected
 
     def of_points(v: int, index: Indices) -> Array:
+        """Return how unit parameters move points of view v, (K, N, 3), scanner frame."""
         scan = capture.scans[v]
         smooth = corrections(scan.points.take(index, axis=0) - scan.eye, measurement.scan_views[v].cosine[index])
         smooth = smooth if own[v] else np.zeros_like(smooth)
@@ -169,7 +179,13 @@ def sum_smooth_errors(
 
 
 def half_field(measurement: Measurement, views: Mask | None = None) -> Array:
-    """Return (2,): |x/z| and |y/z| in the scanner's frame up to which it sees in some views, but for the corners."""
+    """Return the half width and half height (2,) of the scanner's field, as |x/z| and |y/z| in its frame.
+
+    They are the `_FIELD_QUANTILE` quantiles over all points, which leaves out the corners.
+
+    Args:
+        views: (V,) bool, the views that count; None: all.
+    """
     scans = measurement.capture.scans
     of_views = scans if views is None else [scan for scan, counts in zip(scans, views, strict=True) if counts]
     away = np.concatenate([scan.points - scan.eye for scan in of_views])
@@ -178,18 +194,31 @@ def half_field(measurement: Measurement, views: Mask | None = None) -> Array:
 
 
 def smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
-    """Return (COARSE + 1, N, 3): what undoes smooth errors along the rays (N, 3) from the scanner's eye, per unit.
+    """Return the corrections (COARSE + 1, N, 3) of N points per unit of each smooth error, scanner frame.
 
-    Legendre products over the field, of unit rms together, and the slope with incidence.
+    They lie along the ray, opposite to the error: COARSE Legendre products over the field, whose rms is 1 together,
+    and 1/cos − 1 of the angle of incidence.
+
+    Args:
+        away: (N, 3) from the scanner's eye to the points.
+        cosine: (N,) of the angle of incidence.
+        half: (2,) half width and height of the field, of `half_field`.
     """
     along = [*legendre_products(away, half, _DEGREE), 1 / cosine - 1]
     return -np.array(along)[..., None] * (away / np.linalg.norm(away, axis=1)[:, None])
 
 
 def _shared_shapes(away: Array, half: Array, standoff: float) -> Array:
-    """Return (S, N, 3): what all views may share besides, finer over the field, along the range, and across the ray.
+    """Return shapes (S, N, 3) of further errors that all views may share, at N points, in the scanner's frame.
 
-    Each is about as large as the others; scanners of bad axes or a bent scale are among them.
+    Along the ray: finer Legendre products over the field, powers of the range. Across the ray, along x and y: slopes
+    and squares over the field, and the range. All are about as large as one; a scanner with skew axes or a nonlinear
+    scale is a combination of them.
+
+    Args:
+        away: (N, 3) from the scanner's eye to the points.
+        half: (2,) half width and height of the field, of `half_field`.
+        standoff: median range, length_unit, from which the range is counted as a share.
     """
     ray = away / np.linalg.norm(away, axis=1)[:, None]
     far = np.linalg.norm(away, axis=1) / standoff - 1
@@ -200,10 +229,14 @@ def _shared_shapes(away: Array, half: Array, standoff: float) -> Array:
 
 
 def legendre_products(away: Array, half: Array, degree: int = _FINE_DEGREE) -> list[Array]:
-    """Return FINE Legendre products (N,) over the field for rays (N, 3); the first COARSE have unit rms together.
+    """Return the Legendre products P_i(x/z) P_j(y/z) with 0 < i + j ≤ degree, each (N,), in the order of i + j.
+
+    There are COARSE of degree 3, FINE of degree 6. Each is divided by i + j, since finer errors are smaller; all by one
+    number that makes the rms of the first COARSE together 1.
 
     Args:
-        half: (2,) of `half_field`, where the products end.
+        away: (N, 3) rays from the scanner's eye.
+        half: (2,) half width and height of the field, of `half_field`: there x/z and y/z count as 1.
     """
     a, b = np.clip(away[:, :2] / away[:, 2:] / half, -1.2, 1.2).T
     powers = [legendre.legvander(x, degree) * np.sqrt(2 * np.arange(degree + 1) + 1) for x in (a, b)]
@@ -225,9 +258,13 @@ class SmoothErrorLikelihood:
 
     @property
     def map_shares(self) -> Array:
-        """Return by cause the likeliest rms of the errors over the noise (C,), under a prior of usual sizes (MAP)."""
+        """(C,) by cause the rms of the errors over the scanner's noise, at the maximum of the posterior (MAP).
+
+        The prior is log-normal about `USUAL_SHARE` with spread `SHARE_SPREAD`.
+        """
 
         def deviance(log_shares: Array) -> tuple[float, Array]:
+            """Return −2 log posterior and its slopes (C,)."""
             prior = (log_shares - np.log(USUAL_SHARE)) / SHARE_SPREAD
             value, slope = self._deviance(log_shares)
             return value + float(prior @ prior), slope + 2 * prior / SHARE_SPREAD
@@ -237,7 +274,10 @@ class SmoothErrorLikelihood:
         return np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
     def share_spread(self, shares: Array) -> Array:
-        """Return standard deviations (C,) of the logarithms of `map_shares`, from their posterior's curvature there."""
+        """Return standard deviations (C,) of the logarithms of the shares (C,), from the posterior's curvature there.
+
+        The curvature of −log posterior is a central difference of the slopes of −2 log likelihood, plus the prior's.
+        """
         logs, step = np.log(shares), 1e-3 * np.eye(len(shares))
         slopes = [self._deviance(logs + s)[1] - self._deviance(logs - s)[1] for s in step]
         curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / SHARE_SPREAD**2
@@ -246,14 +286,15 @@ class SmoothErrorLikelihood:
         return np.sqrt((vectors**2) @ (1 / np.maximum(values, SHARE_SPREAD**-2.0)))
 
     def ml_shares(self, limits: Mapping[int, float] | None = None) -> tuple[Array, float]:
-        """Return shares (C,) without a prior, and −2 log likelihood.
+        """Return the shares (C,) of maximum likelihood, and −2 log likelihood there.
 
         Args:
-            limits: the largest share of some causes.
+            limits: by number of the cause, the largest share that it may have; others have `SHARE_BOUNDS`.
         """
         largest_shares = dict.fromkeys(range(len(self.design)), SHARE_BOUNDS[1]) | dict(limits or {})
         bounds = [(np.log(SHARE_BOUNDS[0]), np.log(size)) for size in largest_shares.values()]
-        # The likelihood is flat where errors are small: from the largest on, and from usual ones.
+        # The likelihood is flat where errors are small, so that one search begins at the largest sizes, one at usual
+        # ones.
         largest = np.array([b for _, b in bounds])
         starts = [largest, np.minimum(largest, np.log(USUAL_SHARE))]
         fits = [minimize(self._deviance, start, jac=True, method="L-BFGS-B", bounds=bounds) for start in starts]
@@ -265,9 +306,13 @@ class SmoothErrorLikelihood:
         return shares[cause] * self.design[cause].T @ np.linalg.solve(self._data_covariance(shares), self.data)
 
     def posterior_covariance(self, cause: int, shares: Array) -> Array:
-        """Return the covariance (K_c, K_c) of the errors of one cause about their estimate, in units of its size.
+        """Return the posterior covariance (K_c, K_c) of the errors of one cause, in units of its size squared.
 
-        It is one where the overlaps tell nothing of them.
+        It is the identity where the overlaps say nothing.
+
+        Args:
+            cause: number of the cause in `design`.
+            shares: (C,) sizes of all causes over the noise.
         """
         columns = shares[cause] * self.design[cause]
         return np.eye(columns.shape[1]) - columns.T @ np.linalg.solve(self._data_covariance(shares), columns)
@@ -278,7 +323,7 @@ class SmoothErrorLikelihood:
         return sum(parts, np.diag(self.scatter))
 
     def _deviance(self, log_shares: Array) -> tuple[float, Array]:
-        """Return −2 log likelihood and its slopes (C,)."""
+        """Return −2 log likelihood at logarithms of the shares (C,), and its slopes (C,) in these."""
         parts = [np.exp(2 * log_share) * t @ t.T for log_share, t in zip(log_shares, self.design, strict=True)]
         spread = sum(parts, np.diag(self.scatter))
         inverse = np.linalg.inv(spread)
@@ -290,16 +335,18 @@ class SmoothErrorLikelihood:
 def shared_error_likelihood(
     sums: PointGram, twists: Array, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
 ) -> SmoothErrorLikelihood:
-    """Return what the overlaps show of errors that are the same in every view: over the field, and over incidence.
+    """Return the likelihood of smooth errors that are the same in every view: causes are the field, and incidence.
 
     Args:
-        sums: of those, and of so many parameters beside them that may have any size.
-        twists: (6V, K) of the views by all of them.
+        sums: over pairs for K parameters: shapes over the field, the one of incidence, then `nuisance` others.
+        twists: (6V, K) left twists of the views that the overlaps make of each parameter.
+        noise: of the scanner along the ray, length_unit.
+        nuisance: number of the last parameters, which may have any size.
     """
     g = unconstrained.overlaps.gram
     of_view = twists.reshape(g.views, 6, -1)
-    # What the poses do not follow: Σ g² less what moving the views takes away; the small step too by which the
-    # iteration ended short of where the views agree best.
+    # Σ g gᵀ less the part that motions of the views absorb. The iteration of the views ended a small step short of
+    # where they agree best: the same step is taken off Σ g e.
     v, w = g.pairs.T
     followed = np.einsum("pik,pil->kl", sums.vector, of_view[v] - of_view[w])
     step = visible_step(g)
@@ -312,15 +359,20 @@ def shared_error_likelihood(
 def view_error_likelihood(
     sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
 ) -> SmoothErrorLikelihood:
-    """Return the likelihood of smooth errors of each part of a session, of those that all share, and of what is beside.
+    """Return the likelihood of smooth errors with the causes SHARED, INCIDENCE and PER_VIEW.
+
+    Shared shapes are the same in all views. Those per view are the same in the views of one part of the session: up to
+    `_MAX_PARTS` parts follow each other in time, of fewer views each is a part.
 
     Args:
-        sums: of `sum_smooth_errors` with errors of every view.
+        sums: of `sum_smooth_errors` with per_view=True.
+        noise: of the scanner along the ray, length_unit.
+        nuisance: number of the last parameters of the sums, which may have any size.
     """
     g = unconstrained.overlaps.gram
     part = part_of_view(g.views)
     parts = int(part[-1]) + 1
-    # The parameter that each column of a pair is: those of every part, then those that all share.
+    # Parameters are COARSE of each part, then those that all share. `at` says which of them a column of a pair is.
     of_parts = [COARSE * part[view][:, None] + np.arange(COARSE) for view in g.pairs.astype(np.int64).T]
     common = COARSE * parts + np.arange(sums.residual.shape[1] - 2 * COARSE)
     at = np.hstack([*of_parts, np.broadcast_to(common, (len(g.pairs), len(common)))])
@@ -333,7 +385,7 @@ def view_error_likelihood(
     square -= both.T @ solve_view_sums(g, *push)
     # The iteration ended a small step short of where the views agree best.
     pull += both.T @ visible_step(g).ravel()
-    # SHARED, INCIDENCE and PER_VIEW in the parameters.
+    # Which parameters an error of each cause changes: a shared coarse shape is the same coefficient in every part.
     each, incidence, shared = np.split(np.eye(width - nuisance), [COARSE * parts, COARSE * parts + 1], axis=1)
     causes = (np.hstack([each @ np.tile(np.eye(COARSE), (parts, 1)), shared]), incidence, each)
     return _likelihood_of(square, pull, causes, g, noise, nuisance, threshold=_NORMAL_NOISE)
@@ -345,7 +397,13 @@ def part_of_view(views: int) -> Indices:
 
 
 def _sum_on_views(sums: PointGram, g: Gram, at: Indices, keep: Mask, width: int) -> Array:
-    """Return Σ w Bᵀg (6V, W) of some pairs on their views; `at` says the parameter that each column of a pair is."""
+    """Return Σ w Bᵀg (6V, width), summed over pairs on their views: positive on the first view, negative on the second.
+
+    Args:
+        at: (P, columns) the parameter that each column of the sums of a pair stands for.
+        keep: (P,) bool, the pairs that count.
+        width: number of parameters.
+    """
     out = np.zeros((g.views, width, 6))
     v, w = g.pairs[keep].astype(np.int64).T
     vectors = np.moveaxis(sums.vector[keep], 1, 2)
@@ -363,16 +421,22 @@ def _likelihood_of(
     nuisance: int = 0,
     threshold: float = _ROUNDING_SHARE,
 ) -> SmoothErrorLikelihood:
-    """Return the likelihood of normal equations (K, K) and (K,), less what moving the views takes away.
+    """Return the likelihood of sizes of errors f from the normal equations M f = vector, in the eigenvectors of M.
+
+    There Mf + noise is N(0, M S M + cσ²M), with S the covariance of f by its causes, σ² the variance between surfaces
+    and c = `_CORRELATION_FACTOR`.
 
     Args:
-        causes: (K − nuisance, K_c) the errors of each cause, of unit size, in those parameters.
-        nuisance: so many of the last parameters may have any size.
-        threshold: combinations that the overlaps show less than this share of the clearest count as not seen.
+        M: (K, K) Σ w g gᵀ less the part that motions of the views absorb.
+        vector: (K,) Σ w g e, less the same.
+        causes: (K − nuisance, K_c) per cause, the parameters per unit of each of its errors.
+        noise: of the scanner along the ray, length_unit: a share of 1 is an error of this size.
+        nuisance: number of the last parameters, which may have any size and are eliminated.
+        threshold: eigenvalues below this share of the largest count as not seen.
     """
     M = (M + M.T) / 2
     if nuisance:
-        # The Schur complement: what no size of those explains.
+        # The Schur complement: what the nuisance parameters cannot explain.
         K = len(M) - nuisance
         taken = M[:K, K:] @ np.linalg.pinv(M[K:, K:], rcond=_ROUNDING_SHARE, hermitian=True)
         M, vector = M[:K, :K] - taken @ M[K:, :K], vector[:K] - taken @ vector[K:]

@@ -39,24 +39,27 @@ _UNSEEN = 0.25
 
 @dataclass(frozen=True)
 class SurfaceTrial:
-    """Columns X (6V, k) of twists tried on sums over pairs, without new matches.
-
-    `points` are the sums of the last columns if these change the points themselves.
-    """
+    """A linear trial of k parameters: twists of the views and sums over pairs, without new correspondences."""
 
     linear: LinearModel
     unconstrained: UnconstrainedPoses
-    X: Array
-    points: PointSums | None = None
+    X: Array  # (6V, k) left twists of the views per unit of each parameter
+    points: PointSums | None = None  # sums of the last parameters, if these move points within a view
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Return coefficients (k,) by generalised least squares without some views."""
         return self._solve(self._white_X, self.linear.white_z, left_out)
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """Return coefficients (k,) under each prior, without some views; zero beyond those that the prior is of."""
+        """Return coefficients (k,) by generalised least squares under each prior, without some views.
+
+        Args:
+            priors: each of the first coefficients; those beyond it are held at zero.
+            left_out: numbers of views that are not counted; None: all count.
+        """
         white, solutions = self._white_X, []
         for prior in priors:
+            # A normal prior is k more observations of the coefficients.
             half, k = np.sqrt(prior.precision), len(prior.precision)
             z = np.append(self.linear.white_z, half * prior.mean)
             solution = self._solve(np.vstack([white[:, :k], np.diag(half)]), z, left_out)
@@ -73,7 +76,11 @@ class SurfaceTrial:
         return fit_columns(white, z)[:k]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """Return Σ w e² (pairs,) after the model moved, of all pairs or of some."""
+        """Return Σ w e² (pairs,) with the views where coefficients (k,) put them, for the present correspondences.
+
+        Args:
+            units: pairs whose sums are returned; None: all.
+        """
         g, points = self.unconstrained.overlaps.gram, self.points
         of_points = points.residual.shape[1] if isinstance(points, PointGram) else 0
         of_views = self.X.shape[1] - of_points
@@ -176,13 +183,16 @@ def surface_model(
     unconstrained: UnconstrainedPoses,
     variances: Callable[[Sequence[str]], Array] | None = None,
 ) -> LinearModel:
-    """Return the linear model of free-network views.
+    """Return the linear model of views that the overlaps alone have placed, about hand-eye and effects in use.
+
+    Effects in use that these views hardly show (`_UNSEEN`) are left out of its mean. Of fewer than `MANY_VIEWS` views
+    the covariance has the prior of pose errors.
 
     Args:
-        capture: without the effects of the model.
-        unconstrained: its views moved by the overlaps alone, from the model's poses.
-        variances: of scatter, noise and further errors of these names, of views that nobody has taken; None: as the
-            views tell.
+        capture: with the effects of the model taken out.
+        unconstrained: its views moved by the overlaps alone, and the twists from the model's poses there.
+        variances: for planned views, which show nothing yet: returns, for the names of further components, the
+            variances of rotation scatter, translation scatter, noise and these. None: fitted to the views.
     """
     gram = unconstrained.overlaps.gram
     frames_of_mount = capture.hand_eye_frames(model.T_mount)
@@ -221,7 +231,10 @@ def surface_model(
 
 
 def _scanner_covariance(measurement: Measurement, unconstrained: UnconstrainedPoses, reduced: ReducedPoses) -> Array:
-    """Return the covariance (1, n, n) of the visible directions by what every scanner errs by."""
+    """Return the covariance (1, n, n) of the visible directions by the smooth errors that every scanner has.
+
+    Of several scanners also by errors of their scales.
+    """
     errors = [field_scatter(measurement, unconstrained)]
     if measurement.views.scanners:
         # What one scanner's millimetre differs by from another's shows, and every pair has it.

@@ -43,12 +43,15 @@ class UnconstrainedPoses:
 def unconstrained_poses(
     capture: Capture, model_poses: Array, gate: float, before: Overlaps | None = None
 ) -> UnconstrainedPoses:
-    """Move all views until overlaps and common targets agree, without regard to the robot.
+    """Return the poses at which overlaps and common targets agree best, without regard to the robot.
+
+    Each iteration matches points within the gate, takes one Gauss–Newton step of all views, and narrows the gate. It
+    ends when a step is small beside the residuals' scatter, or at `_MAXIMUM_ITERATIONS`, where the last poses count.
 
     Args:
-        model_poses: T_reference_scanner (V, 4, 4).
-        gate: first distance between partners, length_unit.
-        before: at poses near by; its pairs of views serve again.
+        model_poses: T_reference_scanner (V, 4, 4), where the views begin.
+        gate: largest distance between corresponding points in the first iteration, length_unit.
+        before: overlaps at poses near by, whose pairs of views are used again; None: they are searched.
 
     Raises:
         NoResultError: no two views overlap.
@@ -65,15 +68,21 @@ def unconstrained_poses(
         ends = is_last_step(overlaps.gram, step, last, _CONVERGED)
         poses, last = take_step(poses, overlaps.gram, step, last)
         if ends:
+            # The next step would be too small to matter: new partners are not worth a search.
             overlaps = carry_overlaps(capture, overlaps, start, poses)
             break
         gate = min(gate, next_gate(overlaps, capture))
         overlaps = collect_overlaps(capture, poses, gate, samples, overlaps)
-    return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps).relative_to(model_poses)
+    twists_unset = np.zeros((len(poses), 6))
+    return UnconstrainedPoses(poses, twists_unset, overlaps).relative_to(model_poses)
 
 
 def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array, LastStep]:
-    """T_reference_scanner (V, 4, 4) after a step (V, 6) about the centre, which makes up for what the last one left."""
+    """Return the poses T_reference_scanner (V, 4, 4) after a step, and this step as the `last` of the next call.
+
+    The step (V, 6), left twists about the centre of the overlaps, is lengthened by Anderson's rule from the step before
+    (`anderson_step`): iterations of nearest neighbours stop short of where they lead.
+    """
     unit = g.displacement_factors
     asked = (step * unit).ravel()
     taken = asked if last is None else anderson_step(asked, *last)
@@ -86,9 +95,14 @@ def has_converged(g: Gram, step: Array, share: float) -> bool:
 
 
 def is_last_step(g: Gram, step: Array, last: LastStep, share: float) -> bool:
-    """Return whether the step (V, 6) after this one converges, as the ratio of this one to the last foretells.
+    """Return whether the step after this one would be small enough to end: a share of the robust sigma, as predicted.
 
-    Then nothing is to be learnt from new partners: the step is taken, and those at hand are carried along.
+    Steps are predicted to shrink by the ratio of this one to the last. Then new partners are not worth a search.
+
+    Args:
+        step: (V, 6) left twists about the centre of the overlaps.
+        last: the step before; None in the first iteration, which is never the last.
+        share: of the residuals' robust sigma, as in `has_converged`.
     """
     if last is None:
         return False
@@ -102,8 +116,14 @@ def visible_step(g: Gram) -> Array:
 
 
 def solve_views(g: Gram, pair_vectors: Array) -> Array:
-    """Return twists H⁺b (6V, K) of the views when pulls (P, 6, K), Σ w Bᵀg, act on the pairs."""
+    """Return H⁺b (6V, K): twists of the views that solve the normal equations, for K right-hand sides given by pair.
+
+    Args:
+        g: normal equations of the views, with H⁺ in the directions that they see.
+        pair_vectors: Σ w Bᵀg (P, 6, K) of each pair of views; it acts on the first view and, negative, on the second.
+    """
     pulls = []
+    # Surfaces and labelled points apart: their directions are judged differently.
     for keep in (~g.labelled, g.labelled):
         b = np.zeros((g.views, 6, pair_vectors.shape[2]))
         v, w = g.pairs[keep].astype(np.int64).T
@@ -114,25 +134,31 @@ def solve_views(g: Gram, pair_vectors: Array) -> Array:
 
 
 def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
-    """Return the same (6V, K) where pulls on the views are given: (6V, K) of surfaces, and of labelled points."""
+    """Return H⁺b (6V, K): twists of the views that solve the normal equations, for K right-hand sides given by view.
+
+    Args:
+        by_surfaces: (6V, K) part of b by the overlaps of surfaces.
+        by_targets: (6V, K) part of b by labelled points.
+    """
     seen = g.visible
     scale, vectors, by_normals = seen.scale[:, None], seen.vectors, seen.of_surfaces
     b = scale * by_surfaces
     if g.labelled.any():
-        # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
+        # Where surfaces see nothing, their part is noise of normals: there only that of the targets counts.
         b = scale * by_targets + by_normals @ (by_normals.T @ b)
     return scale * (vectors @ ((vectors.T @ b) / seen.values[:, None]))
 
 
 def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = None) -> float:
-    """Return the rms (length_unit) that noise leaves between surfaces at perfect poses: √(σ_v² + σ_w²) over all pairs.
+    """Return the rms distance (length_unit) between surfaces at perfect poses, by the scanner's noise alone.
 
-    σ of each view is measured in its own scan, across local quadrics; where the scans are too small
-    for that, `stated` (scanner.noise of the session) stands in. Noise cannot leave more than what was left
-    once every view was free to move: where quadrics took a shape for noise, that is the floor, of a pair as of all.
+    It is √(σ_v² + σ_w²), over all pairs. σ of a view is the noise measured in its own scan, about local quadrics. A
+    quadric may take a shape for noise; so the result is at most the rms that is left once every view was free to move,
+    corrected for the 6 (V − 1) numbers that this used. The same limit holds for a pair, with some tolerance.
 
     Args:
         overlaps: of the registered views.
+        stated: scanner.noise of the session, σ of scans that are too small to measure it; None: not known.
     """
     sigma = np.array([scan.noise for scan in capture.scans])
     sigma = np.where(np.isfinite(sigma), sigma, np.nan if stated is None else stated)

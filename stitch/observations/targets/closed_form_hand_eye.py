@@ -32,7 +32,10 @@ _LINE, _NEXT = 0.02, (1, 2)
 
 
 def closed_form_hand_eye(capture: Capture) -> Array:
-    """Return T_mount_sensor (4, 4) of a capture with sightings.
+    """Return a first hand-eye T_mount_sensor (4, 4) from labelled points, or from the poses of a measured probe.
+
+    Points: several closed forms give rotations, each is improved, and the one with the smallest sum of distances is
+    returned. A probe: A·X = Z·B (Shah 2013).
 
     Raises:
         NoResultError: motions or targets that cannot show the hand-eye.
@@ -50,9 +53,10 @@ def closed_form_hand_eye(capture: Capture) -> Array:
 
 
 def sensor_motions(s: Sightings) -> tuple[Indices, Array]:
-    """Return pairs of views (M, 2) that share three targets or more, and T_first_second (M, 4, 4) of the sensor.
+    """Return pairs of views (M, 2), and the motion T_first_second (M, 4, 4) of the sensor between them.
 
-    Least squares (Kabsch); of each view with the next two.
+    Pairs are each view with the next two, where they share three targets or more that are not in a line. T maps sensor
+    coordinates of the second view to those of the first, by least squares over these targets (Kabsch).
     """
     pairs = []
     T = []
@@ -70,7 +74,10 @@ def sensor_motions(s: Sightings) -> tuple[Indices, Array]:
 
 
 def _starts_from_motions(capture: Capture, s: Sightings) -> Iterator[Array]:
-    """Yield rotations (3, 3) of the hand-eye from how the sensor turned between views."""
+    """Yield rotations (3, 3) of the hand-eye by closed forms of A·X = X·B, for A, B of mount and sensor between views.
+
+    Nothing where no two views share three targets; a solver that fails is left out.
+    """
     pairs, B = sensor_motions(s)
     if not len(B):
         return
@@ -87,7 +94,11 @@ class _PointEquations:
     """left·(R p + t) − P = 0 of N sightings, with the targets' means eliminated."""
 
     def __init__(self, capture: Capture, s: Sightings) -> None:
-        """Take every labelled point of every view, centred and scaled, so that the equations are well conditioned."""
+        """Take the N labelled points in use, centred and scaled, so that the equations are well conditioned.
+
+        `left` is T_reference_mount (N, 4, 4), `p` the point (N, 3) in the sensor's frame, `target` its number (N,), and
+        `of_target` (targets, N) sums over the points of a target.
+        """
         v, slot = np.nonzero(s.used)
         self.left = capture.T_reference_mount[v]
         self.offset = s.points[v, slot].mean(axis=0)
@@ -98,10 +109,13 @@ class _PointEquations:
         self.of_target = csr_matrix((np.ones(len(self.target)), (self.target, np.arange(len(self.target)))))
 
     def linear_starts(self) -> list[Array]:
-        """Return rotations (3, 3) of the linear system, |vec R| imposed and not; those that are near none only alone.
+        """Return one or two rotations (3, 3), the nearest to solutions R of linear least squares in vec R and t (3,).
+
+        One solution has |vec R|² = 3 imposed, as rotations have it, the other not. One that is far from a rotation
+        (singular values off by `_NO_ROTATION`) is left out, unless both are. Weights are 1/|residual|, repeated.
 
         Raises:
-            NoResultError: motions or targets that cannot show it.
+            NoResultError: the motions of the flange, or the targets, do not determine the hand-eye.
         """
         L = self.left[:, :3, :3]
         columns = np.concatenate([np.einsum("nij,nk->nijk", L, self.p).reshape(-1, 3, 9), L], axis=2)
@@ -112,6 +126,7 @@ class _PointEquations:
                 C, b = self._centred(columns, weight), self._centred(self.left[:, :3, 3:] / self.scale, weight)
                 root = np.sqrt(weight)[:, None, None]
                 A, right = (root * C).reshape(-1, 12), -(root * b).ravel()
+                # t is projected out, vec R solved, and t found from it.
                 Q, of_t = np.linalg.qr(A[:, 9:])
                 shown, said = A[:, :9] - Q @ (Q.T @ A[:, :9]), right - Q @ (Q.T @ right)
                 values = np.linalg.svd(shown, compute_uv=False)
@@ -133,7 +148,11 @@ class _PointEquations:
         return [frames.nearest_rotation(R) for R in near or ends]
 
     def improved(self, R: Array) -> tuple[Array, float]:
-        """Return T_mount_sensor (4, 4) from a rotation to begin with, and the sum of distances that it leaves."""
+        """Return T_mount_sensor (4, 4) from a start R (3, 3), and the sum of its residual distances, over `scale`.
+
+        Gauss–Newton steps with weights 1/|residual| minimise this sum. They end at a step below `_STEP_ENDS`, or after
+        `_STEPS`, where the last one counts.
+        """
         L = self.left[:, :3, :3]
         weight = np.ones(len(L))
         t = np.zeros(3)
@@ -157,7 +176,7 @@ class _PointEquations:
         return frames.make(R, self.scale * t - R @ self.offset), float(left.sum())
 
     def _centred(self, rows: Array, weight: Array) -> Array:
-        """Return rows (N, 3, c) less the weighted mean of their target's."""
+        """Return rows (N, 3, c) less the weighted mean of the rows of the same target: its place is eliminated."""
         flat = rows.reshape(len(rows), -1)
         means = (self.of_target @ (weight[:, None] * flat)) / np.maximum(self.of_target @ weight, 1e-300)[:, None]
         return (flat - means[self.target]).reshape(rows.shape)

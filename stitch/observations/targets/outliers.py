@@ -54,14 +54,15 @@ class Outlier(Value):
 
 
 def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
-    """Return one outlier of every view that has some, under a fitted model: its worst target, or else all of it.
+    """Return at most one outlier per view, under a fitted model: its worst target, or the view with all its targets.
 
-    Each view is measured three ways, by multiples of the median over these data: how far a target lies from where the
-    rest of its view has it, how badly all its targets fit each other wherever the view stands, and how far they lie
-    from the model.
+    Three numbers decide, each over its median in these data: the deviation of a target from where the other targets of
+    its view predict it; the misfit of all targets of a view at its best pose; the rms distance of a view from the
+    model. A target is an outlier if the first two exceed `LIMIT_TARGET`; else the view is, if the third exceeds
+    `LIMIT_VIEW`.
 
     Args:
-        variances: (3,) of rotation scatter, translation scatter, factor on the sensor's noise.
+        variances: (3,) of rotation scatter (rad²), translation scatter (length_unit²), factor on the sensor's noise.
     """
     sightings = rows.capture.sightings
     assert sightings is not None
@@ -92,13 +93,15 @@ def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
 
 
 def _slot_deviations(P: Array, residual: Array, slots: int) -> tuple[Array, Array]:
-    """Return how far targets lie from where the rest of their view foretells them, (V, S) in sigmas and in length_unit.
+    """Return how far each target lies from where the rest of its view predicts it, (V, S): in sigmas, in length_unit.
 
-    With P the inverse covariance of a view's residuals e, that deviation is P_ss⁻¹ (P e)_s with covariance P_ss⁻¹.
+    With P the inverse covariance of a view's residuals e, the deviation of target s is P_ss⁻¹ (P e)_s, its covariance
+    P_ss⁻¹.
 
     Args:
         P: (V, m, m).
-        residual: (V, m) of which the first 3S are coordinates, of each target after the other.
+        residual: e (V, m); the first 3S are the coordinates of S targets, target after target, length_unit.
+        slots: S.
     """
     V = len(P)
     pushed = np.einsum("vij,vj->vi", P, residual)[:, : 3 * slots].reshape(V, slots, 3)
@@ -109,7 +112,13 @@ def _slot_deviations(P: Array, residual: Array, slots: int) -> tuple[Array, Arra
 
 
 def mask_outliers(used: Mask, outliers: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
-    """Return what is in use without the outliers, (V, S) bool."""
+    """Return `used` (V, S) without the outliers.
+
+    Args:
+        used: (V, S) bool, sightings in use, of at most S targets a view.
+        targets: names of all targets.
+        target: (V, S) number of the target in each place.
+    """
     used = used.copy()
     for o in outliers:
         used[o.view] &= False if o.target is None else target[o.view] != targets.index(o.target)
@@ -143,7 +152,11 @@ class MislabelledView:
 
 
 def find_mislabelled(sightings: Sightings) -> tuple[MislabelledView, ...]:
-    """Return the views whose names are mixed up; of many targets each view is asked about some, all over its list."""
+    """Return the views whose target names are mixed up: other names make all its distances those of other views.
+
+    A view is a suspect if a distance between two of its targets is off the median over the views by more than
+    `LIMIT_TARGET` sigmas. Of many targets in a view, some are compared, spread over its list.
+    """
     places = target_positions(sightings)
     worst, usually = _distance_deviations(places)
     scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * usually)
@@ -175,12 +188,13 @@ def drop_mislabelled(sightings: Sightings | None) -> Sightings | None:
 
 
 def _distance_deviations(places: Array) -> tuple[Array, float]:
-    """Return for each view (V,) how far a distance between two of its targets is off its median over the views.
+    """Return per view (V,) the largest deviation of a distance between two of its targets, and the median deviation.
 
-    The largest of each view, length_unit; and the median of all deviations, which is what is usual.
+    A deviation is that of a distance from its median over all views, length_unit; 0 where there are too few. Of the
+    targets of a view at most `COMPARED_TARGETS` are compared.
 
     Args:
-        places: (V, K, 3) of the targets, NaN where a view does not show one; of many that it shows some are compared.
+        places: (V, K, 3) of K targets, sensor frame; NaN where a view does not show one.
     """
     largest, all_deviations = np.zeros(len(places)), [np.zeros(0)]
     views_by_targets = defaultdict[tuple[int, ...], list[int]](list)
@@ -200,7 +214,16 @@ def _distance_deviations(places: Array) -> tuple[Array, float]:
 
 
 def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterator[list[int]]:
-    """Yield at most two ways to name n targets, (n, n) apart, so that all distances are the usual ones (K, K)."""
+    """Yield at most two assignments of names to n targets under which all their distances are the usual ones.
+
+    Each is a list of n numbers of targets. A depth-first search that names one target after the other, and gives up
+    after `_TRIALS` trials. A second assignment says that the first is not unique.
+
+    Args:
+        distances: (n, n) between the targets as one view has them, length_unit.
+        usual: (K, K) between the targets by name, NaN where not known.
+        within: largest difference that counts as equal, length_unit.
+    """
     named = list[int]()
     trials = given = 0
     choices: list[Iterator[int]] = [iter(range(len(usual)))]
@@ -219,7 +242,14 @@ def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterato
 
 
 def _consistent_targets(distances: Array, usual: Array, named: list[int], within: float) -> list[int]:
-    """Return the names left for a target, (d,) apart from d that have theirs: what few views say may be open."""
+    """Return the numbers of the names that a further target can have, by its distances to d targets already named.
+
+    Args:
+        distances: (d,) to these, length_unit.
+        usual: (K, K) distances by name; NaN, where few views know one, does not exclude a name.
+        named: (d,) their names.
+        within: largest difference that counts as equal, length_unit.
+    """
     held = named[:COMPARED_TARGETS]
     off = np.abs(usual[:, held] - distances[: len(held)])
     known = np.isfinite(off)

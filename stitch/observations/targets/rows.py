@@ -25,7 +25,7 @@ COMPARED_TARGETS = 24
 
 
 def target_positions(sightings: Sightings) -> Array:
-    """(V, K, 3) targets in the frame of the sensor, NaN where a view does not show one."""
+    """Return where each view shows each target, (V, K, 3), sensor frame; NaN where it does not."""
     places = np.full((len(sightings.target), len(sightings.targets), 3), np.nan)
     view, slot = np.nonzero(sightings.used)
     places[view, sightings.target[view, slot]] = sightings.points[view, slot]
@@ -84,7 +84,10 @@ class Landmarks:
 
 
 def drawing_of(nominal: NominalTargets | None, sightings: Sightings) -> Drawing | None:
-    """Return the drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
+    """Return the nominal places, part frame, of those targets that are seen; None where there is no drawing.
+
+    Where the drawing states no sigma, it is the median sigma of the sightings.
+    """
     if nominal is None:
         return None
     names = sightings.targets
@@ -96,14 +99,15 @@ def drawing_of(nominal: NominalTargets | None, sightings: Sightings) -> Drawing 
 
 
 def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None = None) -> Landmarks:
-    """Return landmarks in the middle (median) of where the views put them under a hand-eye; NaN for one not seen.
+    """Return the landmarks at the median of where the views put them under a hand-eye; NaN for one that is not seen.
+
+    Positions are in the reference frame. The orientation of a probe is a median of rotation vectors, T_reference_part
+    the best fit of the drawing to the positions.
 
     Args:
-        capture: without the effects in use.
-
-    Returns:
-        Rows in length_unit (coordinates) and rad (orientations), `noise` in their squares. What a view does not show
-        has noise 0, so that it counts nothing, and variance 1, so that its block can be inverted.
+        capture: with the effects in use taken out.
+        T_mount: (4, 4) maps sensor to mount.
+        drawing: nominal places of targets; None: none are known.
     """
     s = capture.sightings
     assert s is not None
@@ -118,7 +122,7 @@ def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None 
     if s.rotation is not None:
         turned = (poses[:, :3, :3] @ s.rotation)[s.used.any(axis=1)]
         first = frames.nearest_rotation(np.median(turned, axis=0))
-        # The middle of the turns against a first guess: medians of matrices lean.
+        # The median of matrices is no rotation and is biased; that of rotation vectors from it is neither.
         off = Rotation.from_matrix(turned @ first.T).as_rotvec()
         orientation = Rotation.from_rotvec(np.median(off, axis=0)).as_matrix() @ first
     if drawing is None:
@@ -166,10 +170,14 @@ class TargetRows(Rows):
 
 
 def target_rows(capture: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRows:
-    """Return labelled points linearised about hand-eye and landmarks.
+    """Return the rows of labelled points, linearised about hand-eye and landmarks.
+
+    Rows are coordinates (length_unit) and, of a probe, orientations (rad); `noise` is in their squares. A row that a
+    view does not show has noise 0, so that it counts nothing, and variance 1, so that its block has an inverse.
 
     Args:
-        capture: without the effects in use.
+        capture: with the effects in use taken out.
+        T_mount: (4, 4) maps sensor to mount.
     """
     s = capture.sightings
     assert s is not None
@@ -259,20 +267,21 @@ def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
 
 
 def fit_landmarks(capture: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSquares, Array]:
-    """Return the landmarks by least squares under a hand-eye, the blocks of that fit, and the scatter.
+    """Return the landmarks by least squares under a fixed hand-eye, that least squares problem, and the variances (3,).
+
+    The variances are those of rotation scatter (rad²) and translation scatter (length_unit²) of the flange, and the
+    factor on the sensor's noise, by restricted maximum likelihood.
 
     Args:
-        capture: without the effects in use.
-
-    Returns:
-        The scatter as variances (3,) of rotation, of translation, and the factor on the sensor's noise.
+        capture: with the effects in use taken out.
+        T_mount: (4, 4) maps sensor to mount.
     """
     landmarks = initial_landmarks(capture, T_mount)
     rows = target_rows(capture, T_mount, landmarks)
     mixed = rows.mixed_model(rows.landmarks)
     variances = fit_variances(mixed, both_starts=True).variances
     assert capture.sightings is not None
-    # One working distance for what nobody sees.
+    # A weak prior, its σ one working distance, keeps landmarks finite that no view shows.
     distance = float(np.median(np.linalg.norm(np.concatenate(capture.sightings.points_by_view()), axis=1)))
     precision = np.full(landmarks.size, distance**-2.0)
     blocks = BlockLeastSquares(

@@ -95,10 +95,11 @@ def rms_of(distances: Array) -> float:
 
 
 def target_model(measurement: Measurement, model: Model, drawing: Drawing | None) -> LinearModel:
-    """Return the linear model of a session's labelled points.
+    """Return the linear model of a session's labelled points, linearised about `model`.
 
     Args:
-        measurement: with the sightings that count.
+        measurement: with the sightings that count, others masked.
+        drawing: nominal places of targets; None: none are known.
     """
     capture = corrected_capture(measurement, model)
     landmarks = initial_landmarks(capture, model.T_mount, drawing)
