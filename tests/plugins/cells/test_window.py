@@ -25,7 +25,7 @@ from stitch.plugins.cells.job_files import POSE_COLUMNS, poses_from_columns, rea
 from stitch.plugins.cells.placed_scans import join_scans
 from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
 from stitch.plugins.cells.seam import Limits, Station, bond_gap, find_edge, measure_seam
-from stitch.plugins.cells.window import correct_path
+from stitch.plugins.cells.window import correct_path, read_seam_job, solve_seam
 from stitch.session.scan import prepare_scan
 from tests.command_line import ended
 
@@ -276,6 +276,19 @@ def test_bad_job_is_refused_in_one_line(tmp_path, command, name, old, new, messa
     error = ended(command, tmp_path / name, code=2).err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_how_far_two_scans_stand_apart_is_in_the_gap_and_little_in_the_flush(tmp_path):
+    for file in EXAMPLE.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    job = tmp_path / "seam.toml"
+    alone = solve_seam(read_seam_job(job))
+    job.write_text("pose_sigma = 0.1\n" + job.read_text())
+    stated = read_seam_job(job)
+    assert stated.placed.errors.translation == pytest.approx(0.1 / np.sqrt(2))
+    for seam, other in zip(solve_seam(stated), alone, strict=True):
+        assert seam.sigma_gap == pytest.approx(np.hypot(other.sigma_gap, 0.1), rel=0.2)
+        assert seam.sigma_flush < 0.7 * seam.sigma_gap
 
 
 def test_expected_region_without_points_is_no_fit(pane_cad):
