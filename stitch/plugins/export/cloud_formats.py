@@ -1,10 +1,12 @@
 """The stitched cloud, and its mesh where there is one, for other programs, coloured by residual.
 
-Frame: that of the run, the flange or the base. Unit: metres where the format says so (E57, glTF), else the session's.
+Frame: that of the run, the flange or the base; or that of the datum its features were measured in. Unit: metres where
+the format says so (E57, glTF), else the session's.
 """
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.stored_run import fused_cloud
@@ -35,6 +39,7 @@ class ColouredCloud:
     span: float  # residual of the last colour, length_unit
     length_unit: str
     mesh: Path | None  # mesh.ply of the run, if there is one
+    T_mesh: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) from the mesh's frame to that of the points
 
 
 def coloured_cloud(folder: Path) -> ColouredCloud:
@@ -57,6 +62,27 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
         )
     mesh = folder / "mesh.ply"
     return coloured(fused, unit, mesh if mesh.is_file() else None)
+
+
+def in_datum(cloud: ColouredCloud, folder: Path) -> ColouredCloud:
+    """Return the cloud of a run folder in the frame of the datum of its features.json.
+
+    Raises:
+        InputError: no features were measured there in the frame of a datum.
+    """
+    file = folder / "features.json"
+    try:
+        T = np.array(json.loads(file.read_text(encoding="utf-8"))["T_datum_reference"], float)
+    except (OSError, ValueError, KeyError, TypeError):
+        T = np.zeros(0)
+    if not frames.is_rigid(T):
+        raise InputError(f"{file}: says no datum; to fix: run stitch measure with datum in FEATURES.toml first")
+    fused = replace(
+        cloud.fused,
+        points=frames.transform(T, cloud.fused.points),
+        normals=frames.rotate(T, cloud.fused.normals),
+    )
+    return replace(cloud, fused=fused, T_mesh=T)
 
 
 def coloured(fused: FusedCloud, length_unit: str, mesh: Path | None = None) -> ColouredCloud:
@@ -133,7 +159,7 @@ def write_glb(cloud: ColouredCloud, path: Path) -> None:
     if cloud.mesh is None:
         shape: Any = trimesh.PointCloud(cloud.fused.points * metres, colors=cloud.colours)
     else:
-        shape = trimesh.load_mesh(cloud.mesh, process=False)
+        shape = trimesh.load_mesh(cloud.mesh, process=False).apply_transform(cloud.T_mesh)
         _, nearest = KDTree(np.ascontiguousarray(cloud.fused.points)).query(np.array(shape.vertices), k=1)
         shape.visual = trimesh.visual.ColorVisuals(shape, vertex_colors=cloud.colours[nearest])
         shape.apply_scale(metres)

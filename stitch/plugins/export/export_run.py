@@ -63,6 +63,9 @@ _On = Annotated[
     list[Path] | None,
     typer.Option("--on", metavar="SESSION", help="Of an arm: another session of it, which it must not make worse."),
 ]
+_Datum = Annotated[
+    bool, typer.Option("--datum", help="A cloud in the frame of the datum that stitch measure counted from.")
+]
 _Part = Annotated[int, typer.Option("--part", metavar="N", help="Of a fit with several parts: the one to follow.")]
 
 
@@ -83,6 +86,7 @@ def export_run(
     j3: _J3 = None,
     part: _Part = 1,
     on: _On = None,
+    datum: _Datum = False,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,
@@ -107,6 +111,8 @@ def export_run(
     require_new(output)
     if program is None and to not in _FORMATS:
         raise InputError(f"--to {to}: no such format{did_you_mean(str(to), _FORMATS)}; to fix: one of {_KINDS}")
+    if datum and to not in CLOUD:
+        raise InputError(f"--datum: is of a cloud; to fix: name one of --to {', '.join(CLOUD)}")
     if program is not None and (run / "fit.json").is_file():
         _export_moved_program(program, run / "fit.json", output, frame, part=part, as_json=as_json)
     elif program is not None:
@@ -127,7 +133,7 @@ def export_run(
         if eye.of_effects:
             say(eye.of_effects, stream=sys.stderr)
     else:
-        _export_cloud(run, str(to), output)
+        _export_cloud(run, str(to), output, datum)
         if as_json:
             _emit_files(str(to), output)
 
@@ -175,9 +181,9 @@ def _emit_files(to: str, output: Path | None, text: str | None = None) -> None:
     emit(to_json({"to": to, "text": text, "files": [] if output is None else [str(output)]}))
 
 
-def _export_cloud(run: Path, to: str, output: Path | None) -> None:
+def _export_cloud(run: Path, to: str, output: Path | None, datum: bool) -> None:
     from stitch.numerics.units import MICROMETRES
-    from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured_cloud
+    from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured_cloud, in_datum
     from stitch.system.files import whole_file
 
     if output is None or output.suffix.lower() != f".{to}":
@@ -185,6 +191,7 @@ def _export_cloud(run: Path, to: str, output: Path | None) -> None:
     write, lost = CLOUD_FORMATS[to]
     with show_activity("export: reading and writing the cloud"), whole_file(output) as file:
         cloud = coloured_cloud(run)
+        cloud = in_datum(cloud, run) if datum else cloud
         write(cloud, file)
     span = cloud.span * MICROMETRES[cloud.length_unit]
     colours = f"coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"

@@ -27,8 +27,8 @@ def cloud(request, tmp_path):
     run = bare_run(tmp_path / "r", np.eye(4), np.eye(6), length_unit=request.param)
     write_cloud(FusedCloud(POINTS, NORMALS, RESIDUAL, np.full(300, 2)), run / "stitched.ply")
 
-    def export(kind):
-        ended("export", run, "--to", kind, "-o", tmp_path / f"c.{kind}")
+    def export(kind, *options):
+        ended("export", run, "--to", kind, "-o", tmp_path / f"c.{kind}", *options)
         return str(tmp_path / f"c.{kind}")
 
     return export, {"mm": 1e-3, "m": 1.0}[request.param]
@@ -115,6 +115,34 @@ def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
     assert mode == 4 and indices.ravel().tolist() == [0, 1, 2]  # triangles
     assert np.allclose(own["POSITION"], POINTS[[0, 279, 299]] * metres, rtol=1e-6)
     assert [tuple(c) for c in own["COLOR_0"][:, :3]] == [DARK, BRIGHT, GREY]
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb"])
+def test_cloud_and_mesh_lie_in_the_frame_of_the_datum(cloud, tmp_path, kind):
+    export, metres = cloud
+    T = np.array([[0, -1, 0, 5.0], [1, 0, 0, -7.0], [0, 0, 1, 2.0], [0, 0, 0, 1]])
+    (tmp_path / "r" / "features.json").write_text(json.dumps({"T_datum_reference": T.tolist()}))
+    vertices = np.array([tuple(POINTS[i]) for i in (0, 279, 299)], [(a, "<f8") for a in "xyz"])
+    faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements).write(str(tmp_path / "r" / "mesh.ply"))
+    there = POINTS @ T[:3, :3].T + T[:3, 3]
+    if kind == "ply":
+        vertex = PlyData.read(export("ply", "--datum"))["vertex"]
+        assert np.allclose(np.column_stack([vertex[a] for a in "xyz"]), there, atol=1e-3)
+        assert np.allclose(vertex["nx"], -0.6) and np.allclose(vertex["ny"], 0.0)
+    else:
+        own, _, _ = gltf(export("glb", "--datum"))
+        assert np.allclose(own["POSITION"], there[[0, 279, 299]] * metres, rtol=1e-5)
+        assert [tuple(c) for c in own["COLOR_0"][:, :3]] == [DARK, BRIGHT, GREY]
+
+
+def test_without_a_datum_there_is_no_frame_of_it(cloud, tmp_path):
+    run = tmp_path / "r"
+    (run / "features.json").write_text('{"T_datum_reference": null}')
+    told = ended("export", run, "--to", "ply", "-o", tmp_path / "c.ply", "--datum", code=2)
+    assert "features.json: says no datum; to fix: run stitch measure" in told.err
+    assert "--datum: is of a cloud; to fix" in ended("export", run, "--to", "ros", "--datum", code=2).err
 
 
 @pytest.mark.parametrize(
