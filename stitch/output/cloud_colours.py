@@ -13,9 +13,10 @@ _UNKNOWN = (150, 150, 150)
 
 
 def residual_colours(residual: Array) -> tuple[Colours, float]:
-    """Return colours (N, 3) of residuals (N,), and the residual of the last colour.
+    """Return colours (N, 3), bytes, of residuals (N,), and the residual at the end of the colour scale.
 
-    The colours are those of viridis, dark blue at zero; grey where the residual is NaN, since one view alone saw.
+    The scale is viridis: dark blue at zero, yellow at the `_SPAN` quantile and beyond. A residual is NaN where a single
+    view saw the point; it becomes grey. The residuals are not negative, in any unit.
     """
     from matplotlib import colormaps
 

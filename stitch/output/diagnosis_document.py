@@ -34,10 +34,13 @@ def finding_lines(document: dict[str, Any]) -> tuple[str, ...]:
 
 
 def named_before(document: dict[str, Any], tried: dict[str, str]) -> Finding | None:
-    """Return the effects that a standing diagnosis of a run names to be added; None where it names none.
+    """Return what a stored diagnosis of a run names to be added; None where it names nothing.
+
+    Nothing is named either where its first effect was dropped before, or is less likely than no effect at all.
 
     Args:
-        tried: effects that were fitted in the run and dropped again.
+        document: diagnosis.json.
+        tried: effects that were fitted in the run and dropped again, with the reason.
     """
     try:
         odds = document["log_odds_over_nothing"]
@@ -54,7 +57,10 @@ def named_before(document: dict[str, Any], tried: dict[str, str]) -> Finding | N
 
 
 def _candidate_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return a row for each effect that was tested, then for each that lacks what it needs."""
+    """Return a row of diagnosis.json for each effect that was tested, then for each that could not be.
+
+    An untested effect lacks something that it `needs`, such as joint angles; its numbers are null.
+    """
     unknown = ("p_value", "rms_if_added", "heldout_rms_if_added", "left_out", "minimum_detectable")
     untested = [
         {
@@ -73,7 +79,10 @@ def _candidate_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
-    """Return a candidate as diagnosis.json has it."""
+    """Return the row of diagnosis.json of an effect that was tested: chance, sizes, rivals, what it would bring.
+
+    Values are null where the views cannot observe it, or where no cross-validation was made.
+    """
     ranked, validation = candidate.ranked, candidate.cross_validation
     observable = ranked.score.observable
     inside, heldout = (None, None) if validation is None else diagnosis.rms_if_added(validation)
@@ -101,7 +110,11 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
 
 
 def _rivals(diagnosis: Diagnosis, ranked: Ranked) -> list[dict[str, Any]]:
-    """Return what was built against a candidate that the views can see, the likeliest first; nothing missing is one."""
+    """Return the likeliest alternatives to a candidate, and the log odds of the candidate over each of them.
+
+    Alternatives are the other effects, laws without a name, and that nothing is missing. The likeliest comes first, at
+    most `_RIVALS`; empty where the views cannot observe the candidate.
+    """
     if not ranked.score.observable:
         return []
     odds = {c.name: c.ranked.log_posterior for c in diagnosis.candidates if c.ranked.score.observable}
@@ -112,7 +125,11 @@ def _rivals(diagnosis: Diagnosis, ranked: Ranked) -> list[dict[str, Any]]:
 
 
 def _parameters(score: Score) -> dict[str, Any]:
-    """Return what was tried and what was fitted of a candidate's best form."""
+    """Return the parameters of a candidate's best form by name: value, sigma and unit.
+
+    Parameters of which a grid of values was tried, such as time constants, have no sigma. Those that enter linearly
+    were fitted.
+    """
     rows = {p.name: parameter_row(p) | {"sigma": None} for p in score.form.term.parameters if p.grid}
     if score.observable and score.fitted:
         for p, value, sigma in zip(score.form.free, score.values, score.sigmas, strict=True):
@@ -121,7 +138,10 @@ def _parameters(score: Score) -> dict[str, Any]:
 
 
 def _law_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return the laws of the dictionary that are told: rivals of a name, or what is found where none is given."""
+    """Return rows of the empirical laws of a diagnosis: at a place, the error follows a quantity in some shape.
+
+    They are alternatives to the effect that is named, or the finding itself where no effect is.
+    """
     rows = []
     for ranked in diagnosis.laws:
         law = law_of(ranked)

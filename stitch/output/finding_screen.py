@@ -56,7 +56,7 @@ _SEEN_SHARE = 1e-4
 
 @remembered
 def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the screen of a diagnosis; lengths in length_unit, angles in rad."""
+    """Return the screen of a diagnosis as JSON, the entry `screen` of diagnosis.json; length_unit and rad."""
     candidates = compared(diagnosis)
     patches, present, if_added = _fields(diagnosis, candidates)
     trends = trends_of_candidates(diagnosis.linear, [c.ranked.score for c in candidates])
@@ -82,9 +82,9 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
 def _fields(
     diagnosis: Diagnosis, candidates: Sequence[CandidateEffect]
 ) -> tuple[Patches | None, DisagreementField | None, dict[str, DisagreementField]]:
-    """Return the field of disagreement on its patches as the run shows it, and as each candidate would leave it.
+    """Return patches of the part's surface, the views' disagreement on them now, and that with each candidate added.
 
-    None without clouds.
+    Disagreement is the signed distance between the surfaces of two views, length_unit. Without clouds: None, None, {}.
     """
     history, registered = model_history(diagnosis.run), diagnosis.run.registered
     if history is None or registered is None:
@@ -94,13 +94,17 @@ def _fields(
     for candidate in candidates:
         after = predicted_distances(diagnosis.linear, candidate.ranked.score, registered.matches)
         assert before is not None and after is not None
+        # Only the change is predicted: it is added to the field that was measured.
         change = patches.field(after - before)
         if_added[candidate.name] = replace(present, values=present.values + change.values)
     return patches, present, if_added
 
 
 def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
-    """Return the candidate effects that a screen compares, those that are named first, then those that help most."""
+    """Return up to `_BEST` fitted effects that a screen compares: first those named by the diagnosis, then the best.
+
+    The best are those that leave the smallest share of the mean square error on views left out.
+    """
     named = diagnosis.effects
 
     def heldout(candidate: CandidateEffect) -> float:
@@ -118,7 +122,11 @@ def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
 
 
 def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | None:
-    """Return the trend of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
+    """Return the trend that is drawn as the reason for a finding; None where there is none.
+
+    It is that of the effect which is missing; where nothing is, that of the model's last effect. For an unknown effect
+    it is the law, the joint's curve or the covariate that the error follows most clearly.
+    """
     linear = diagnosis.linear
     if diagnosis.verdict in _NAMING:
         return trends.get(diagnosis.effects[0])
@@ -135,6 +143,7 @@ def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | 
 def _candidate_row(
     diagnosis: Diagnosis, candidate: CandidateEffect, field: DisagreementField | None, trend: EffectTrend | None
 ) -> dict[str, Any]:
+    """Return a candidate as a screen lists it; `field` is the disagreement on the part that it would leave."""
     validation = candidate.cross_validation
     return {
         "effect": candidate.name,
@@ -154,7 +163,10 @@ def _place(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
 
 
 def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
-    """Return whether a candidate fits these views, and why not where it does not."""
+    """Return "yes", "no" or "not needed" for a candidate, followed by the reason where there is one.
+
+    Reasons in order: it leaves more error than the effect named; it is rarer; a note objects; the evidence.
+    """
     if diagnosis.verdict == "adequate":
         return "not needed"
     unit = diagnosis.linear.measurement.length_unit
@@ -180,7 +192,10 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
 
 
 def _deciding_view(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> dict[str, Any] | None:
-    """Return what the first two rivals expect in the view that is proposed to tell them apart, over their dots."""
+    """Return what each undecided effect predicts for the first proposed view, and how likely the views decide.
+
+    None where nothing is undecided, or where no pose is proposed; joints in degrees, `wait_s` in s.
+    """
     rivals = [c.ranked.score for c in compared(diagnosis) if c.name in diagnosis.effects and c.name in trends]
     pose = next((proposal for proposal in diagnosis.next if proposal.joints_deg is not None), None)
     if diagnosis.verdict != "cannot_tell" or len(rivals) < 2 or pose is None or pose.joints_deg is None:
@@ -204,7 +219,7 @@ def _deciding_view(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> dict
 
 
 def _on_part(field: DisagreementField | None) -> dict[str, Any]:
-    """Return mean and worst disagreement on the part, and the value of every place; null where nothing compares."""
+    """Return mean and worst disagreement on the part, and that of every patch, length_unit; null where unknown."""
     if field is None:
         return {"mean": None, "worst": None, "field": None}
     worst = float(np.nanmax(field.overall, initial=0.0))
@@ -214,7 +229,10 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
 
 
 def _formula(diagnosis: Diagnosis) -> str:
-    """Return the law that is drawn and its numbers, that of each rival where none is named; empty without a name."""
+    """Return the formula of the effect that is named with its fitted numbers, as a sentence; empty without a name.
+
+    Undecided effects get a sentence each; where nothing is missing, it is that of the model's last effect.
+    """
     if diagnosis.verdict in _NAMING:
         laws = [f"{r.score.candidate.effect.formula}; {fitted_amounts(r)}" for r in diagnosis.named]
         if diagnosis.verdict == "missing_effect":
@@ -229,6 +247,7 @@ def _formula(diagnosis: Diagnosis) -> str:
 
 
 def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
+    """Return a trend as a screen draws it, its dots as lists of numbers; None for None."""
     if trend is None:
         return None
     words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
@@ -243,7 +262,7 @@ def _rounded(values: Array) -> list[float]:
 
 
 def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
-    """Return what is missing, in one sentence."""
+    """Return the headline of the screen by the verdict: what is missing, in one or two sentences."""
     match diagnosis.verdict:
         case "adequate":
             in_model = [effect_description(name) or name for name in diagnosis.linear.model.effects]
@@ -269,7 +288,11 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
 
 
 def _tested(diagnosis: Diagnosis, which: str) -> str:
-    """Return among how many effects none was found, and how many could not be tested."""
+    """Return the sentence that none of the tested effects was found, and how many could not be tested.
+
+    Args:
+        which: "missing " or "further ", the adjective before "effect".
+    """
     tried = effects_tried(diagnosis)
     untested = len(diagnosis.candidates) - tried + len(diagnosis.missing)
     others = f"; {untested} could not be tested" if untested else ""
@@ -282,7 +305,10 @@ def effects_tried(diagnosis: Diagnosis) -> int:
 
 
 def untested_text(diagnosis: Diagnosis) -> str:
-    """Return which effects could not be tested and what they need, a sentence for each need; empty where all were."""
+    """Return which effects could not be tested and what they need, a sentence for each need; empty where all were.
+
+    Effects lack other poses (not observable), or data of the session, such as joint angles.
+    """
     unseen = [c.name for c in diagnosis.candidates if not c.ranked.score.observable]
     lines = [f"These views cannot show {' and '.join(unseen)}: other poses are needed."] if unseen else []
     for needs in dict.fromkeys(diagnosis.missing.values()):
@@ -294,11 +320,11 @@ def untested_text(diagnosis: Diagnosis) -> str:
 
 
 def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return what the error on views left out comes from: kind, words and rms (length_unit); the squares add up to its
-    own.
+    """Return the sources of the error on views left out: kind, words and rms (length_unit) of each.
 
-    What is named takes what it would take away; of the rest the scanner's noise, and what no motion of the views
-    removes. What is left then is shared out as the variances of whole views are: new in every view, or repeating.
+    Their squares add up to the square of that error, but for negligible ones. First comes what the named effect would
+    take away, then the scanner's noise, then the misfit that no motion of the views removes. The remainder is split as
+    the budget of the views' poses is: into errors new in every view (the arm's scatter) and repeating ones.
     """
     total = diagnosis.heldout_rms**2
     if not np.isfinite(total):
@@ -312,6 +338,7 @@ def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     scanner = min(diagnosis.noise_floor**2, total - explained)
     misfit = min(diagnosis.overlap_misfit**2, total - explained - scanner)
     left = max(total - explained - scanner - misfit, 0.0)
+    # These sources are counted above already, or are corrected by the model.
     beside = {*diagnosis.effects, *diagnosis.linear.model.effects, "sensor noise", "scanner field"}
     shares = [(line.source, line.variance_share) for line in diagnosis.budget if line.source not in beside]
     whole = sum(share for _, share in shares)
@@ -326,9 +353,10 @@ def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def unseen_text(diagnosis: Diagnosis) -> str:
-    """Return below which size effects do not show in these views, and how far they then move the views (rms).
+    """Return a sentence with the smallest detectable sizes of effects, and how far these move the views (rms).
 
-    Of the three that could move them most; empty where something is named, or no size is known.
+    It lists the three that move the views most, beyond what a change of the hand-eye could do too. Empty unless nothing
+    is missing, and where no size is known.
     """
     if diagnosis.verdict != "adequate":
         return ""
@@ -341,6 +369,7 @@ def unseen_text(diagnosis: Diagnosis) -> str:
         size = candidate.detectable.get(name or "", np.inf)
         if not np.isfinite(size):
             continue
+        # Displacement of the views per unit of the parameter, without the part that the hand-eye can imitate.
         column = project_out(hand_eye, every.reduced[:, k : k + 1])
         moved = size * float(np.linalg.norm(column)) / np.sqrt(max(linear.mixed.size, 1))
         factor, shown = display_unit(every.term.parameters[k].unit)
@@ -351,17 +380,18 @@ def unseen_text(diagnosis: Diagnosis) -> str:
 
 
 def clearest_parameter(candidate: CandidateEffect) -> str | None:
-    """Return the parameter that these views know best against its plausible size; None where none has a size."""
+    """Return the parameter with the smallest ratio of detectable to plausible size; None where none is detectable."""
     plausible = {p.name: p.typical for p in candidate.ranked.score.candidate.parameters}
     detectable = candidate.detectable
     return min(detectable, key=lambda name: detectable[name] / plausible[name]) if detectable else None
 
 
 def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend], unnamed: Sequence[str]) -> str:
-    """Return what these views cannot tell apart, in two sentences where it is one joint.
+    """Return the headline where the views cannot decide between several causes; shorter where all are of one joint.
 
     Args:
-        unnamed: what explains the views as well and has no name, in words.
+        named: the effects that explain the views equally well.
+        unnamed: laws without the name of an effect that do so too, in words.
     """
     joints = {trends[c.name].moves if c.name in trends else "" for c in named}
     joint = joints.pop() if len(joints) == 1 else ""
@@ -380,7 +410,8 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend], un
 
 
 def _decided_by(diagnosis: Diagnosis) -> str:
-    """Return how likely the proposed views decide, as a sentence; empty where no pose does."""
+    """Return how probably the proposed views will decide, as a sentence; empty where no pose is proposed."""
+    # Each probability is that of deciding with this view and those before it.
     odds = [proposal.probability for proposal in diagnosis.next if proposal.probability is not None]
     if not odds:
         return ""
@@ -389,9 +420,10 @@ def _decided_by(diagnosis: Diagnosis) -> str:
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
-    """Return the cause as a sentence without its full stop."""
+    """Return an effect as a sentence without its full stop: with the joint, link or view at which it acts, if known."""
     name = candidate.name
     term = candidate.ranked.score.form.at(candidate.ranked.score.values)
+    # A discrete parameter is the view before which an event took place.
     view = next((p.view for p in term.parameters if p.discrete), "")
     when = f" before view {view}" if view else ""
     if trend is not None and name in JOINT_DESCRIPTIONS and trend.moves.startswith("joint"):
@@ -405,7 +437,7 @@ def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
 
 
 def _clear_links(candidate: CandidateEffect) -> list[str]:
-    """Return the numbers of the links that are clearly off; none where they are more than two."""
+    """Return the numbers of the links with a parameter beyond `_CLEAR` sigmas; none if more than `_MOST_LINKS`."""
     scored = candidate.ranked.score
     sized = zip(scored.form.free, scored.values, scored.sigmas, strict=True)
     clear = {re.sub(r"\D", "", p.name) for p, value, sigma in sized if abs(value) > _CLEAR * sigma}
@@ -419,9 +451,15 @@ def _proof(
     present: DisagreementField | None,
     if_added: dict[str, DisagreementField],
 ) -> str:
-    """Return how large it is, and what it does to the error on views left out and to the worst place of the part.
+    """Return sentences that back a finding: size of the effect, error on views left out now and with it, noise.
 
-    No size is told where no single effect is named.
+    The size is given only where a single effect is named.
+
+    Args:
+        candidates: effects on the screen.
+        trends: by effect, what it does over the views.
+        present: disagreement of the views on the part now; None without clouds.
+        if_added: by effect, that disagreement with it in the model.
     """
     unit = diagnosis.linear.measurement.length_unit
     now = length_text(diagnosis.heldout_rms, unit, 2)
@@ -446,7 +484,11 @@ def _proof(
 
 
 def _worse_place(effect: str, present: DisagreementField | None, then: DisagreementField | None, unit: str) -> str:
-    """Return what an effect does to the worst place of the part where that grows; empty elsewhere."""
+    """Return a clause that the worst disagreement on the part would grow with an effect; empty if it would not.
+
+    Args:
+        present, then: disagreement now, and with the effect in the model; None without clouds.
+    """
     if present is None or then is None:
         return ""
     before, after = (length_text(float(np.nanmax(field.overall)), unit, 2) for field in (present, then))
@@ -455,13 +497,19 @@ def _worse_place(effect: str, present: DisagreementField | None, then: Disagreem
 
 
 def _size(why: EffectTrend, unit: str) -> str:
-    """Return how far off an effect puts things, and how much of that the hand-eye takes, as a sentence."""
+    """Return the largest error that an effect makes, and how much of it the hand-eye imitates, as a sentence.
+
+    Args:
+        why: trend of the effect: `effect` as nature has it, `predicted` what remains beside the hand-eye.
+        unit: length unit.
+    """
 
     def told(value: float) -> str:
         return angle_text(value, 2) if why.value_unit == "rad" else length_text(value, unit, 2)
 
     largest, drawn = (float(np.abs(values).max()) for values in (why.effect, why.predicted))
     size = told(largest)
+    # An event such as a slip displaces some views alike: these are counted.
     away = int(np.sum(np.abs(why.effect) > largest / 2))
     if why.follows == "view order" and away <= len(why.views) / 2:
         return f"{away} of {len(why.views)} views sit {size} away from the others."
@@ -476,7 +524,7 @@ def _size(why: EffectTrend, unit: str) -> str:
 
 
 def certainty(diagnosis: Diagnosis) -> str:
-    """Return how sure the finding is: what chance alone would do, and what the other effects would explain."""
+    """Return in sentences how sure the finding is, by the verdict: chance, and the share of the other effects."""
     match diagnosis.verdict:
         case "missing_effect" | "cannot_tell" if not diagnosis.certain:
             odds = odds_text(diagnosis.log_odds_over_nothing)
@@ -510,7 +558,7 @@ def certainty(diagnosis: Diagnosis) -> str:
 
 
 def chance_text(p: float) -> str:
-    """Return how often chance alone would show as much, as a sentence."""
+    """Return a p-value as a sentence: in how many sessions chance alone would show as much."""
     if p < 1e-6:
         often = "less than one of a million sessions"
     elif p < 0.01:

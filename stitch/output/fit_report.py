@@ -19,10 +19,10 @@ _WIDTH = 100
 
 
 def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
-    """Return the block, as lmfit's fit_report has it: a heading in double brackets, and its lines.
+    """Return a run as a block of text in the style of lmfit's fit_report: headings in double brackets, their lines.
 
     Args:
-        at_part: U (k = 2) of the hand-eye at the part, mm and mrad.
+        at_part: U (k = 2) of the hand-eye at the part, mm and mrad; zero: not known.
     """
     session = run.session
     of_all = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
@@ -46,7 +46,10 @@ def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
 
 
 def run_hand_eye_lines(run: RunData) -> list[str]:
-    """Return the hand-eye of a run with U (k = 2); what its views do not show is not known, or as it was stated."""
+    """Return lines with the hand-eye of a run and its U (k = 2), those of each scanner where there are several.
+
+    Directions that the views do not show are said to be unknown, or to be as stated.
+    """
     lines = hand_eye_lines(
         run.T_mount,
         run.mount_covariance,
@@ -56,6 +59,7 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         stated=run.session.states_hand_eye,
     )
     unit = run.session.length_unit
+    # Of several scanners, the first one's lines take the place of those above.
     for scanner in run.scanners:
         own = hand_eye_lines(scanner.T_mount, scanner.covariance, run.session.mount, unit, unknown=scanner.unknown)
         lines = [*(lines if scanner is not run.scanners[0] else []), f"Scanner {scanner.name}: {own[0]}", *own[1:]]
@@ -68,6 +72,7 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         place = length_text(shift, run.session.length_unit, 2)
         usual = "with usual sizes of effects that these views cannot show"
         lines.append(f"  U anywhere the arm reaches {place} and {angle_text(turn, 2)}, {usual}")
+    # Without a robot the first external axis carries the scanner, and its frame stands for the base.
     if not run.session.has_poses:
         axis = run.session.reference_frame
         lines[0] = lines[0].replace("T_base", f"T_{axis}").replace("frame of the base", f"frame of axis {axis}")
@@ -75,7 +80,11 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
 
 
 def _guessed_lines(usual: Mapping[str, str]) -> list[str]:
-    """Return what the numbers above rest on that is only usual."""
+    """Return lines on what was assumed, such as a length unit, because neither files nor scans state it.
+
+    Args:
+        usual: the value assumed, by what it is of.
+    """
     of = {"length_unit": "the poses", "cloud_unit": "the clouds"}
     units = [f"{of[what]} are in {value}" for what, value in usual.items() if what in of]
     others = [f"{what} {value}" for what, value in usual.items() if what not in of]
@@ -91,7 +100,10 @@ def axis_lines(run: RunData) -> list[str]:
 
 
 def report_rows(run: RunData) -> list[tuple[str, str]]:
-    """Return names and values: errors, of every model so far on views left out, noise, scatter, fitted effects."""
+    """Return rows (name, text) of a run's numbers: errors, noise, scatter of the poses, fitted effects, points dropped.
+
+    The error on views left out is that of every model in the ledger.
+    """
     (_, heldout), (_, inside), (_, noise), scatter = _errors(run)
     amounts: dict[str, list[str]] = {}
     for effect, p in _fitted(run):
@@ -112,7 +124,7 @@ def report_rows(run: RunData) -> list[tuple[str, str]]:
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:
-    """Return a heading and its lines, wrapped; nothing without lines."""
+    """Return a heading in double brackets, then lines wrapped to `_WIDTH` and indented; empty without lines."""
     wrapped = [wrap(line, _WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines]
     return [f"[[{heading}]]", *(row for rows in wrapped for row in rows)] if lines else []
 
@@ -122,7 +134,7 @@ def _aligned(rows: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def _errors(run: RunData) -> list[tuple[str, str]]:
-    """Return residuals, noise and the scatter of the poses."""
+    """Return four rows (name, text): residual on views left out, in the fit, noise floor, scatter of the poses."""
     unit, scatter = run.session.length_unit, run.repeatability
     return [
         ("on views left out", length_text(run.heldout_rms, unit)),
@@ -133,14 +145,17 @@ def _errors(run: RunData) -> list[tuple[str, str]]:
 
 
 def _fitted(run: RunData) -> list[tuple[str, Parameter]]:
-    """Return parameters that were fitted or tried, with the names of their effects."""
+    """Return (effect, parameter) for each parameter that was fitted, or of which a grid of values was tried.
+
+    Without those that describe the geometry of the cell, such as external axes.
+    """
     return [
         (term.name, p) for term in run.terms for p in term.parameters if (p.fitted or p.grid) and not term.is_geometry
     ]
 
 
 def _history(run: RunData) -> list[tuple[str, str]]:
-    """Return every step of the model, where there are several, with its error on views left out."""
+    """Return rows (change of the model, error on views left out) of the ledger; empty if the model never changed."""
     if len(run.ledger) < 2:
         return []
     unit = run.session.length_unit

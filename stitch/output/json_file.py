@@ -32,15 +32,17 @@ _PICTURES = {
 
 
 def is_run_file(path: Path) -> Ours:
-    """Return whether a path inside the run folder `path` was written by stitch."""
+    """Return a function that says of a path, relative to the run folder `path`, whether stitch writes such a file."""
     inner = set(_inner_runs(path))
 
     def is_ours(inside: Path) -> bool:
-        """Return whether a file, by its path inside the folder, is one that a run writes."""
+        """Return whether a file, by its path relative to the folder, is one that a command writes."""
+        # The folder of several sessions holds a run folder for each.
         if inside.parts[0] in inner:
             inside = inside.relative_to(inside.parts[0])
         match inside.parts:
             case (name,):
+                # .NAME.new is a file that was being written when the process ended.
                 return name in FILES or (name.startswith(".") and name.endswith(".new") and name[1:-4] in FILES)
             case (folder, *_) if folder == FITS:
                 return True
@@ -52,7 +54,7 @@ def is_run_file(path: Path) -> Ours:
 
 
 def sessions_in(path: Path) -> list[str] | None:
-    """Return paths of the sessions of a run folder as it states them; None for a folder that is no run."""
+    """Return paths of the sessions of which a folder holds the run, as its results state them; None: it is no run."""
     if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
         return None
     folders = (path, *(path / name for name in _inner_runs(path)))
@@ -61,7 +63,10 @@ def sessions_in(path: Path) -> list[str] | None:
 
 
 def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
-    """Refuse a place for a run of `sessions` where something would be lost.
+    """Refuse a path for the run folder of `sessions` where something would be lost.
+
+    Args:
+        force: allow the run of other sessions to be replaced.
 
     Raises:
         InputError: `path` lies in a session, holds one, holds the present folder, is no run, or is one of other
@@ -107,7 +112,11 @@ def runs_of_rig(path: Path) -> list[str]:
 
 
 def _inner_runs(path: Path) -> list[str]:
-    """Return names of the runs in the folder of a rig, or of one run of several scanners."""
+    """Return names of the run folders inside a folder of several runs; empty for any other folder.
+
+    Such a folder belongs to several sessions (model.toml, but no result.json), or to one run of several scanners, whose
+    result.json lists them.
+    """
     if not path.is_dir() or not (path / "model.toml").is_file():
         return []
     if (path / "result.json").exists() and "scanners" not in read_json_object(path / "result.json"):
@@ -116,6 +125,7 @@ def _inner_runs(path: Path) -> list[str]:
 
 
 def _session_path(file: Path) -> str | None:
+    """Return the path of the session that a result.json states; None where the file is no result of stitch."""
     document = read_json_object(file)
     session = document.get("session") if document.get("format") == FORMAT else None
     return session if isinstance(session, str) and "\0" not in session else None
@@ -133,7 +143,7 @@ def to_json(document: Any) -> str:
 
 
 def _without_nan(value: Any) -> Any:
-    """Return a value with null in the place of numbers that are not finite, which JSON does not have."""
+    """Return a value of JSON, numbers in it that are not finite replaced by None; lists and tables at any depth."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

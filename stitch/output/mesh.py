@@ -51,12 +51,13 @@ def write_mesh(mesh: TriangleMesh, path: Path) -> None:
 def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh:
     """Return the surface through points (N, 3) with unit normals (N, 3), open where there are no points.
 
-    Marching cubes (Lorensen & Cline 1987) over the signed distance from the points' weighted tangent planes: implicit
-    moving least squares (Kolluri 2008), in the cells about the points alone. Nothing is closed that nobody saw.
+    Marching cubes (Lorensen & Cline 1987) find the zero of a signed distance: that from the weighted tangent planes of
+    the nearest points, implicit moving least squares (Kolluri 2008). Only cells near points are searched, so that no
+    hole is closed.
 
     Args:
-        outside: cells by which the surface is sought outside, before its vertices are moved back: a sheet that is
-            thinner than a cell has corners of cells within it only so.
+        outside: offset in cell edges. The surface at this distance is found first, then its vertices are moved back.
+            A sheet thinner than a cell would have no corner of a cell inside it, and be missed.
 
     Raises:
         NoResultError: the points span no surface.
@@ -71,7 +72,7 @@ def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh
     heights, nearest = _heights(places, points, normals, tree, size)
     cells = cells[(nearest < _REACH * size)[cells].all(axis=1)]
     vertices, triangles, _ = igl.marching_cubes(heights, places, cells, outside * size)
-    # Beyond the last points the tangent planes run on; what lies farther than a hole between points ends there.
+    # Beyond the rim of the points the tangent planes run on: triangles too far from every point are dropped.
     gap, nearest = tree.query(vertices, k=1)
     triangles = triangles[(gap < np.hypot(_OVERHANG, outside) * size)[triangles].all(axis=1)]
     if not len(triangles):
@@ -84,16 +85,29 @@ def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh
 
 
 def spacing(points: Array, tree: Any) -> float:
-    """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
+    """Return the mean spacing of points (N, 3), the edge of the square of surface per point, in their unit.
+
+    The disc of radius r to the 8th neighbour holds 8 squares s²: s = r √(π/8), the median over a sample of the points.
+
+    Args:
+        tree: KDTree of the points.
+    """
     distance, _ = tree.query(points[:: max(1, len(points) // _SAMPLES)], k=9)
     return float(np.median(distance[:, -1]) * np.sqrt(np.pi / 8))
 
 
 def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
-    """Return corners (P, 3) of the cells in or beside which points lie, and per cell its eight corners (C, 8)."""
+    """Return the cells of a cubic grid that hold a point or touch such a cell, by their corners.
+
+    Returns:
+        Positions (P, 3) of the corners, each once; and (C, 8) indices of the corners of each cell, in the order of
+        `_CORNERS`.
+    """
+    # A margin of two cells: neighbours of the outermost cells have indices inside the grid.
     origin = points.min(axis=0) - 2 * size
     cell = np.floor((points - origin) / size).astype(np.int64)
     shape = cell.max(axis=0) + 3
+    # A cell or corner (i, j, k) as one number.
     steps = np.array([shape[1] * shape[2], shape[2], 1])
     around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     keys = np.unique(np.unique(cell @ steps)[:, None] + around @ steps)
@@ -103,25 +117,37 @@ def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
 
 
 def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
-    """Return the signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
+    """Return the signed distance of P places from the surface through N points, and that from the nearest point.
 
+    It is the weighted mean of (place − point)·(normal + n̄) / 2 over the nearest points, n̄ their mean normal. Weights
+    are exp(−(d² − d₀²) / size²) for distances d, d₀ the least, times the cosine to the normal of the nearest point.
+
+    Args:
+        places: (P, 3), in the frame and unit of the points.
+        points, normals: (N, 3); normals of unit length, outwards.
+        tree: KDTree of the points.
+        size: edge of a cell, and width of the weights.
+
+    Returns:
+        Signed distances (P,), positive outside; distances (P,) from the nearest point.
+    """
     # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take longer.
     point_columns = np.ascontiguousarray(points.T)
     normal_columns = np.ascontiguousarray(normals.T)
 
     def heights_of(block: Array) -> tuple[Array, Array]:
-        """Return heights (P,) of places (P, 3) over the surface of their nearest points, and how far (P,) these lie."""
+        """Return both distances (B,) of a block of places (B, 3); arrays are (axis i, neighbour k, place p)."""
         distance, index = (np.ascontiguousarray(x.T) for x in tree.query(block, k=_NEIGHBOURS))
         facing = np.array([column.take(index) for column in normal_columns])
         away = np.array([at - column.take(index) for column, at in zip(point_columns, block.T, strict=True)])
-        # Of a thin sheet only the nearer side counts.
+        # Normals that face away belong to the other side of a thin sheet: their weight is zero.
         agree = np.maximum(np.einsum("ikp,ip->kp", facing, facing[:, 0]), 0)
         weight = agree * np.exp((distance[0] ** 2 - distance**2) / size**2)
         weight /= weight.sum(axis=0)
         here = np.einsum("kp,ikp->ip", weight, facing)
         here /= np.sqrt(np.einsum("ip,ip->p", here, here))
-        # Tangent planes at the points lie above a convex surface, one at the place itself below it: on a ball the
-        # mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
+        # `here` is the normal at the place. Tangent planes at the points lie above a convex surface, one at the place
+        # below it: on a ball the mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
         facing += here[:, None]
         return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", facing, away)) / 2, distance[0]
 

@@ -45,10 +45,10 @@ def make_mesh(cloud: FusedCloud, kind: str) -> "tuple[TriangleMesh, MeshFit]":
 
 
 def watertight(points: Array, normals: Array) -> TriangleMesh:
-    """Compute the closed surface through points (N, 3) with unit normals (N, 3).
+    """Return the closed surface through points (N, 3) with unit normals (N, 3).
 
-    Screened Poisson reconstruction (Kazhdan & Hoppe 2013), trimmed where its points are sparse; each opening that is
-    left is closed by a fan about its middle. Bits repeat: the solver runs on one thread.
+    Screened Poisson reconstruction (Kazhdan & Hoppe 2013), trimmed where its points are sparse. Each opening that the
+    trimming leaves is closed by triangles from its middle. One thread solves, so that results repeat to the last bit.
 
     Raises:
         InputError: Open3D is not installed, or lacks a library of the system.
@@ -62,6 +62,7 @@ def watertight(points: Array, normals: Array) -> TriangleMesh:
     solve = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         surface, density = solve(cloud, depth=_octree_depth(points), scale=_BOX_SCALE, n_threads=1)
+    # Density of the points at each vertex, as a level of the octree: one level less has an eighth of the points.
     levels = np.asarray(density)
     triangles = np.asarray(surface.triangles, np.int64)
     triangles = triangles[(levels > np.median(levels) - _SPARSE_LEVELS)[triangles].all(axis=1)]
@@ -69,7 +70,7 @@ def watertight(points: Array, normals: Array) -> TriangleMesh:
 
 
 def light(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
-    """Return a mesh with about so many triangles, by quadric error metrics (Garland & Heckbert 1997).
+    """Return a mesh simplified to about `triangles` triangles, by quadric error metrics (Garland & Heckbert 1997).
 
     Raises:
         InputError: Open3D is not installed, or lacks a library of the system.
@@ -83,11 +84,10 @@ def light(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
 
 
 class MeshFit:
-    """How a mesh lies to the points (N, 3) that it was made of, of the same frame and unit; of many some are asked."""
+    """How far a mesh lies from the points (N, 3) that it was made of, in the same frame and unit."""
 
     def __init__(self, mesh: TriangleMesh, points: Array) -> None:
-        """Measure how a mesh lies to points (N, 3): distances of some of them, and what of it no point supports."""
-
+        """Measure the distance of up to `_ASKED` points (N, 3) from a mesh, and the area of the mesh far from any."""
         import igl
 
         tree = KDTree(np.ascontiguousarray(points, float))
@@ -102,7 +102,7 @@ class MeshFit:
         self.unseen = float(area[far].sum() / area.sum())  # share of the area far from all points
 
     def sentence(self, length_unit: str) -> str:
-        """Return the numbers in plain words."""
+        """Return the numbers as sentences for people; those on unseen area only of a closed mesh."""
         unseen = f" Nobody looked at {self.unseen:.0%} of its area." if self.closed else ""
         return (
             f"mesh.ply: {'closed' if self.closed else 'open'}, {self.triangles:,} triangles. Half of the fused points "
@@ -112,22 +112,30 @@ class MeshFit:
 
 
 def _octree_depth(points: Array) -> int:
-    """Return the depth at which a cell of the octree is no larger than the points' spacing."""
+    """Return the least depth at which an octree's cell is no larger than the spacing of points (N, 3).
+
+    The octree's cube is `_BOX_SCALE` times as large as the points' longest side; each level halves its cells.
+    """
     size = float(np.ptp(points, axis=0).max())
     return int(np.ceil(np.log2(_BOX_SCALE * size / spacing(points, KDTree(np.ascontiguousarray(points, float))))))
 
 
 def _rim(triangles: Indices) -> Indices:
-    """Return the directed edges (E, 2) of triangles (T, 3) that no neighbour runs through the other way."""
+    """Return the boundary of triangles (T, 3): directed edges (E, 2) that no other triangle has in reverse."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     count = int(triangles.max(initial=0)) + 1
+    # An edge (a, b) as one number, a·count + b.
     there = edges @ [count, 1]
     back = edges[:, ::-1] @ [count, 1]
     return edges[~np.isin(there, back)]
 
 
 def _without_pinches(triangles: Indices) -> Indices:
-    """Return triangles (M, 3) of vertices without those at a vertex where two openings meet: no fan closes both."""
+    """Return triangles (M, 3) without those at a vertex where two openings meet.
+
+    There two boundary edges begin, and openings could not be told apart. Removal may create new such vertices, hence
+    the loop; it ends since triangles only become fewer.
+    """
     while len(triangles):
         pinched = np.bincount(_rim(triangles)[:, 0], minlength=triangles.max() + 1) > 1
         if not pinched.any():
@@ -137,7 +145,11 @@ def _without_pinches(triangles: Indices) -> Indices:
 
 
 def _large_parts(triangles: Indices) -> Indices:
-    """Return the triangles of connected parts that are no scraps."""
+    """Return those of triangles (T, 3) in connected parts with at least `_PART_SHARE` of the largest part's triangles.
+
+    Raises:
+        NoResultError: there are no triangles.
+    """
     if not len(triangles):
         raise NoResultError(NO_SURFACE)
     part = _connected(triangles[:, [0, 1, 1, 2]].reshape(-1, 2), int(triangles.max()) + 1)[triangles[:, 0]]
@@ -146,9 +158,13 @@ def _large_parts(triangles: Indices) -> Indices:
 
 
 def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
-    """Return the mesh with a fan over each opening, and without the vertices that no triangle has."""
+    """Return the mesh of vertices (V, 3) and triangles (T, 3) with every opening closed, unused vertices removed.
+
+    Each boundary edge of an opening makes a triangle with the opening's middle, a new vertex: a fan.
+    """
     rim = _rim(triangles)
     opening = _connected(rim, len(vertices))[rim[:, 0]]
+    # Labels of connected parts, renumbered: opening 0, 1, … of each boundary edge.
     _, opening = np.unique(opening, return_inverse=True)
     count = np.bincount(opening)[:, None]
     middles = np.column_stack([np.bincount(opening, column) for column in vertices[rim[:, 0]].T]) / np.maximum(count, 1)
@@ -158,6 +174,6 @@ def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
 
 
 def _connected(edges: Indices, count: int) -> Indices:
-    """Return a label (count,) per vertex, the same where edges (E, 2) join two."""
+    """Return (count,) labels of vertices: equal where a chain of edges (E, 2) connects them."""
     graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1]

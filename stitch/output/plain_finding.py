@@ -26,7 +26,10 @@ _AFTER_ADDING = ", after adding it"
 
 
 def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
-    """Return the doubts about the session, what is missing, and how far the error should fall with it."""
+    """Return the finding of a diagnosis in plain sentences, open doubts about the session first.
+
+    A doubt, such as a moved part, may itself be the cause of what the diagnosis finds.
+    """
     finding = _finding(diagnosis, length_unit)
     doubts = open_doubts(diagnosis)
     if not doubts:
@@ -36,12 +39,15 @@ def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
 
 
 def open_doubts(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return the doubts about the session that are something else than the effect which is missing."""
+    """Return the doubts about the session, without one that the effect named by the diagnosis would explain."""
     return tuple(doubt for doubt in diagnosis.doubts if doubt != _same_as_finding(diagnosis))
 
 
 def _same_as_finding(diagnosis: Diagnosis) -> str | None:
-    """Return the doubt that the effect which is missing would hold; None where there is none, or several."""
+    """Return the doubt about the session whose cure is to fit the effect that is missing; None where none is.
+
+    None also where several doubts propose that effect: then it cannot be told which of them it explains.
+    """
     if not diagnosis.doubts or diagnosis.verdict != "missing_effect" or not diagnosis.likelier_than_not:
         return None
     same = [doubt for doubt in diagnosis.doubts if effect_cure(diagnosis.effects[0]) in doubt]
@@ -49,7 +55,7 @@ def _same_as_finding(diagnosis: Diagnosis) -> str | None:
 
 
 def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
-    """Return what is missing, and how far the error should fall with it."""
+    """Return what is missing in plain sentences, by the verdict, and how far the error should fall with it."""
     named = " or ".join([*map(effect_in_words, diagnosis.effects), *unnamed_in_words(diagnosis)])
     sure = diagnosis.certain or diagnosis.log_odds_over_nothing > ODDS
     odds = "" if sure else f" The odds against chance are {odds_text(diagnosis.log_odds_over_nothing)}."
@@ -78,9 +84,14 @@ def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
 
 
 def _expected_gain(residual_rms: float, validation: CrossValidation, length_unit: str) -> str:
-    """Return how far the error should fall, or where else the effect shows.
+    """Return a sentence on what adding an effect should bring, by cross-validation.
 
-    A small one moves poses by less than chance moves a residual.
+    That is the fall of the rms residual. Where this is too small to see, it is the better prediction of the poses of
+    views left out, if there is any.
+
+    Args:
+        residual_rms: of the run, length_unit.
+        validation: `inside` and `poses` are the shares of the mean square error that the effect leaves.
     """
     share = validation.inside**0.5
     before = length_text(residual_rms, length_unit)
@@ -95,7 +106,11 @@ def _expected_gain(residual_rms: float, validation: CrossValidation, length_unit
 
 
 def _remaining_error(scanner_error: FieldError | None, length_unit: str) -> str:
-    """Return what explains the remaining error where no effect is missing."""
+    """Return what explains the remaining error where no effect is missing, as a part of a sentence.
+
+    Args:
+        scanner_error: smooth error of the scanner, by view or over its field; None: none was found.
+    """
     if scanner_error is None:
         return "noise and the arm's scatter"
     if scanner_error.by_view:
@@ -106,7 +121,10 @@ def _remaining_error(scanner_error: FieldError | None, length_unit: str) -> str:
 
 
 def _error_location(diagnosis: Diagnosis) -> str:
-    """Return the scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' sentence."""
+    """Return the end of the sentence on an unknown effect: what the error follows, or where it is; may be empty.
+
+    The most specific statement comes first: scanner, law, joint, time, shape of the part, then single covariates.
+    """
     if diagnosis.follows_field and diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view:
         return ": each scan has its own error, as if the part bent or the scanner changed"
     if diagnosis.follows_field:
@@ -130,9 +148,9 @@ def _error_location(diagnosis: Diagnosis) -> str:
 
 
 def remedy_at_machine(diagnosis: Diagnosis) -> str:
-    """Return what would end the effect that is named, or where to look for one without a name, as a sentence.
+    """Return a sentence on what to do at the machine: how to end the effect that is named, or where to look.
 
-    Empty where something is missing without a place to look, or only perhaps.
+    Empty where the effect is not certain, or where there is no place to look.
     """
     remedy, when = "", ""
     if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
@@ -164,7 +182,11 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
 
 
 def suggested_command(diagnosis: Diagnosis, run: str) -> str:
-    """Return the command that most would type now, with what it is for; `run` as it has to be typed."""
+    """Return the command to type next, with what it is for.
+
+    Args:
+        run: path of the run as it has to be typed in a shell.
+    """
     if open_doubts(diagnosis):
         return f"Next: fix the problem above; for details: stitch review {run}"
     if any(proposal.probability is not None for proposal in diagnosis.next):
@@ -173,7 +195,11 @@ def suggested_command(diagnosis: Diagnosis, run: str) -> str:
 
 
 def command_without_a_view(diagnosis: Diagnosis, run: str) -> str:
-    """Return the command for those who measure nothing further; as `suggested_command`."""
+    """Return the command to type next if no further view is taken, with what it is for.
+
+    Args:
+        run: path of the run as it has to be typed in a shell.
+    """
     match diagnosis.verdict:
         case "missing_effect" if not diagnosis.likelier_than_not:
             return f"Next, for views that would separate it from chance: stitch next {run}"
@@ -195,15 +221,18 @@ def command_without_a_view(diagnosis: Diagnosis, run: str) -> str:
 
 
 def _group_helps(diagnosis: Diagnosis) -> bool:
-    """Return False where `stitch add --group` would refuse, or has just refused: it predicts no view left out."""
+    """Return whether the effects that cannot be told apart predict views left out better when fitted together.
+
+    Where they do not, `stitch add --group` refuses.
+    """
     members = [c.ranked.score for c in diagnosis.candidates if c.name in diagnosis.effects]
     return group_helps(*group_share(diagnosis.linear, members))
 
 
 def largest_error_sources(budget: Sequence[BudgetLine]) -> list[BudgetLine]:
-    """Return sources of at least 1 % of the variance, largest first, then all others as one line; shares add up to 1.
+    """Return sources of at least 1 % of the variance, largest first, then all others as one line.
 
-    Empty where there is no budget, or nothing in it.
+    The shares add up to 1. Empty where the budget is.
     """
     sources = sorted((line for line in budget if line.variance_share > 0), key=lambda line: -line.variance_share)
     large = [line for line in sources if line.variance_share >= _MIN_SHARE]

@@ -113,6 +113,6 @@ def effect_in_words(name: str) -> str:
 
 
 def plain_covariate(name: str) -> str:
-    """Return a covariate as people call it: j2_deg is the angle of joint 2."""
+    """Return a covariate in words without its unit: j2_deg is the angle of joint 2."""
     joint = re.fullmatch(r"j(\d+)_deg", name)
     return f"the angle of joint {joint[1]}" if joint else covariate_text(name).partition(" (")[0]

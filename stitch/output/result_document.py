@@ -86,7 +86,10 @@ def ledger(run: RunData) -> list[dict[str, Any]]:
 
 
 def model_of(run: RunData) -> ModelFile:
-    """Return the model that a run fitted, as model.toml states it; a file of effects while one of them is in use."""
+    """Return the model of a run as model.toml states it.
+
+    It names a Python file of effects only while an effect of a user is in it.
+    """
     return ModelFile(
         length_unit=run.session.length_unit,
         mount=run.session.mount,
@@ -103,7 +106,10 @@ def model_of(run: RunData) -> ModelFile:
 
 
 def _effects_file(run: RunData) -> str | None:
-    """Return the file of effects that are no library's and no package's; of several origins the run's own."""
+    """Return the Python file of the user's effects in the model; None without any.
+
+    It is `FILE`, written into the run folder, where they come from several files, from such a file, or from no file.
+    """
     origins = {e.origin or run.effects_file or FILE for e in own_effects(run)}
     file = origins.pop() if len(origins) == 1 else FILE
     return None if not own_effects(run) else FILE if Path(file).name == FILE else file
@@ -116,10 +122,10 @@ def own_effects(run: RunData) -> list[Effect]:
 
 
 def effects_source(run: RunData) -> str | None:
-    """Return the text of the file of effects that a run folder holds itself; None where it needs none.
+    """Return the text of `FILE`, the file of the user's effects in the run folder; None where none is needed.
 
     Raises:
-        InputError: there is none that another program could read.
+        InputError: the source of an effect is not at hand, or would not run on its own.
     """
     own = own_effects(run)
     if _effects_file(run) != FILE:
@@ -133,14 +139,16 @@ def _hand_eye_alone(run: RunData) -> HandEyeAlone | None:
 
 
 def residual_columns(fit: TargetModelFit, session: SessionData) -> dict[str, Array]:
-    """Return columns of residuals.parquet of labelled points, a row per target and view.
+    """Return columns of residuals.parquet of labelled points, a row per target and view in which it is used.
 
-    `partner` is the target, `residual` the 3D distance; `time_s` is NaN where nobody states it.
+    `partner` is the target; x, y, z its fitted position in the reference frame. `residual` is the 3D distance of the
+    measured point from it (length_unit), (nx, ny, nz) its direction. Covariates and `time_s` are NaN where unknown.
     """
     rows = fit.rows
     sightings = rows.sightings
     v, slot = np.nonzero(sightings.used)
     target = sightings.target[v, slot]
+    # Rows of views come first; each begins with the residuals of positions, three numbers a slot.
     offset = rows.residual[: len(sightings.used), : rows.positions].reshape(*sightings.used.shape, 3)[v, slot]
     distance = np.linalg.norm(offset, axis=1)
     covariates = sorted({key for view in session.views for key in view.covariates})
@@ -169,7 +177,7 @@ def parameter_row(parameter: Parameter) -> dict[str, Any]:
 
 
 def excluded_views(document: dict[str, Any]) -> tuple[ExcludedView, ...]:
-    """Return the views that the run of a result left out."""
+    """Return the views that a run left out, with reason and pose, from its result.json."""
     rows = {row.view: row for row in view_rows(document)}
     return tuple(
         ExcludedView(item["view"], item["why"], rows[item["view"]].pose, rows[item["view"]].points)
@@ -184,7 +192,7 @@ def view_rows(document: dict[str, Any]) -> tuple[ViewRow, ...]:
 
 
 def has_model(document: dict[str, Any], model: ModelFile) -> bool:
-    """Return whether hand-eye and parameters of a result are those of a model."""
+    """Return True if a result.json has exactly the hand-eye and the parameters of a model.toml."""
     stated = {effect: {p: row["value"] for p, row in rows.items()} for effect, rows in document["effects"].items()}
     values = {effect: {p: fitted.value for p, fitted in rows.items()} for effect, rows in model.effects.items()}
     return stated == values and np.array_equal(document["hand_eye"], model.T_mount)
@@ -201,10 +209,14 @@ def registered_gate(document: dict[str, Any]) -> float | None:
 
 
 def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovariance:
-    """Return what a result, read from a file, says of its effects' parameters; nothing where it does not.
+    """Return the covariance of the effects' parameters that a result.json states; an empty one where it states none.
+
+    Args:
+        document: result.json.
+        file: its path, for messages.
 
     Raises:
-        InputError: a matrix of another size than its names, or without variances.
+        InputError: a matrix of another size than its names, or without positive variances.
     """
     if not (stated := document.get("effects_covariance")):
         return EffectsCovariance()
@@ -223,7 +235,10 @@ def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovarianc
 
 
 def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
-    """Return the measurement as a result counts its labelled points: less the outliers, weighed against the clouds."""
+    """Return the measurement with labelled points as the stored fit used them; without such points, as it is.
+
+    The outliers that result.json lists are not used, and points weigh against clouds by its `cloud_noise_factor`.
+    """
     capture = measurement.capture
     sightings = capture.sightings
     if sightings is None:
@@ -241,7 +256,7 @@ def restore_counted_targets(measurement: Measurement, session: SessionData, docu
 
 
 def _targets(fit: TargetModelFit | None) -> dict[str, Target]:
-    """Return the targets that were seen."""
+    """Return the targets that were located, by name: position (3,), sigma and orientation in the reference frame."""
     if fit is None:
         return {}
     places = fit.landmarks.positions
@@ -253,7 +268,7 @@ def _targets(fit: TargetModelFit | None) -> dict[str, Target]:
 
 
 def _target_rows(run: RunData) -> list[dict[str, Any]]:
-    """Return the targets in the reference frame, and in how many views each was seen."""
+    """Return rows of result.json of the targets: position in the reference frame, sigma, number of views."""
     if run.targets is None:
         return []
     sightings = run.targets.rows.sightings
@@ -271,6 +286,7 @@ def _sizes(distances: Array) -> dict[str, float]:
 
 
 def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
+    """Return rows of the labelled points that were not used: view, target, distance, and its ratio to the usual one."""
     return [
         {"view": run.session.views[o.view].name, "target": o.target, "distance": o.distance, "times_usual": o.times}
         for o in run.outliers
@@ -287,7 +303,10 @@ def _labelled_beside_clouds(run: RunData) -> bool:
 
 
 def _all_views(run: RunData) -> list[ViewRow]:
-    """Return all views of the session in their order; those that were left out stand between those that are fused."""
+    """Return rows of all views in the order of the session, fused ones and those that were left out.
+
+    A fused view knows its number in the session; the views left out fill the numbers between, in their own order.
+    """
     rows = {
         int(place): ViewRow(view.name, run.poses[v], run.corrections[v], float(run.view_rms[v]), points_of(view))
         for v, (view, place) in enumerate(zip(run.session.views, run.measurement.views.number, strict=True))
@@ -303,19 +322,23 @@ def _has_stock(run: RunData) -> bool:
 
 
 def _stock_rows(run: RunData) -> list[StockRow]:
-    """Return the stock that was taken off the scans."""
+    """Return a row for each scan with stock, material still on the part there: its thickness, and the pose's sigma."""
     scans = zip(run.session.names, run.measurement.capture.scans, strict=False)
     found = [(name, scan.stock) for name, scan in scans if scan.stock is not None]
     return [StockRow(name, s.thickness, s.sigma, s.share, _pose_sigma(run, name)) for name, s in found]
 
 
 def _pose_sigma(run: RunData, name: str) -> Array:
-    """Return the sigmas (6,) of the pose of a view, beside the mean of the others."""
+    """Return sigmas (6,) of a view's pose relative to the mean of the other views, reference frame.
+
+    Rotation first, rad, then the motion of the middle of the view's points, length_unit. With A the difference of this
+    view's twist and the mean of the others', they are the roots of the diagonal of A C Aᵀ, C the poses' covariance.
+    """
     assert run.registered is not None
     capture, count, view = run.measurement.capture, len(run.poses), run.session.names.index(name)
     scatter = run.repeatability
     if not np.isfinite(scatter.noise_factor):
-        # A run that was read again does not know it.
+        # A run that was read from its folder does not know the noise factor: it is found again.
         unconstrained = unconstrained_poses(capture, run.poses_model, run.gate)
         scatter = capture_repeatability(capture, unconstrained, run.T_mount)
     method = method_named(run.register_method)
@@ -327,14 +350,17 @@ def _pose_sigma(run: RunData, name: str) -> Array:
 
 
 def stock_of_views(document: dict[str, Any], names: Sequence[str]) -> dict[int, Stock]:
-    """Return the stock that the run of a result took off, by the place of its view among some names; no points yet."""
+    """Return the stock that a result.json states, by the index of its view in `names`.
+
+    Which points belong to it is not stored: the mask is empty, and `locate_stock` finds them again.
+    """
     rows = [StockRow(**row) for row in document.get("stock", ())]
     nowhere = np.zeros(0, bool)
     return {names.index(r.view): Stock(r.thickness, r.sigma, r.share, nowhere) for r in rows if r.view in names}
 
 
 def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
-    """Return where several scanners stand, and what the views of each say by themselves."""
+    """Return rows of the scanners of a joined session: its hand-eye, and that from its own views alone."""
     parts = {part.scanner.name: part for part in run.session.parts}
     return [
         {"scanner": place.name, "session": parts[place.name].name} | _SCANNER.write(place) for place in run.scanners
@@ -342,13 +368,14 @@ def _scanner_rows(run: RunData) -> list[dict[str, Any]]:
 
 
 def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[dict[str, Any], ModelFile]]:
-    """Return result and model of each scanner among several by the name of its session: what another run of it needs.
+    """Return result.json and model of each single scanner of a joined run, by the name of its session.
 
-    From those of all are taken the scanner's own hand-eye, the effects that it has by itself or with all, and its
-    views; what only all together have, as the covariance of effects, is left away.
+    Another run can so use the model of one scanner. It has that scanner's hand-eye, the effects of this scanner or of
+    all, and its views. Entries that hold only for all scanners together, such as the effects' covariance, are left out.
+    Names EFFECT@SCANNER and VIEW@SCANNER lose their ending.
 
     Args:
-        whole: result.json of all.
+        whole: result.json of the joined run.
     """
     common = model_of(run)
     documents = {}
@@ -387,13 +414,13 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
 
 
 def _own_rows(rows: list[dict[str, Any]], scanner: str) -> list[dict[str, Any]]:
-    """Return the rows of one scanner's views, under the names that its session has for them."""
+    """Return the rows of views VIEW@SCANNER of one scanner, their `view` without the ending."""
     own = [row for row in rows if row["view"].endswith(f"@{scanner}")]
     return [row | {"view": row["view"].removesuffix(f"@{scanner}")} for row in own]
 
 
 def scanners_alone(document: dict[str, Any]) -> tuple[ScannerAlone, ...]:
-    """Return what a result says of each of several scanners by its own views."""
+    """Return the hand-eye of each scanner from its own views alone, of a result.json; empty for one scanner."""
     rows = [(row["scanner"], row["alone"]) for row in document.get("scanners", ()) if "alone" in row]
     return tuple(
         ScannerAlone(name, np.array(own["hand_eye"], float), np.array(own["hand_eye_covariance"], float))
@@ -402,7 +429,7 @@ def scanners_alone(document: dict[str, Any]) -> tuple[ScannerAlone, ...]:
 
 
 def _disagreement(run: RunData) -> dict[str, Any] | None:
-    """Return how far the views disagree on the part at every step of the model's history; None without clouds."""
+    """Return how far the views disagree on the part at every step of the ledger, length_unit; None without clouds."""
     history = model_history(run)
     if history is None or run.registered is None:
         return None

@@ -60,9 +60,9 @@ def recordings(folder: Path) -> list[Recorder]:
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
-    """Write binary PLY with normals, `residual` and `views`, how many support a point.
+    """Write a cloud as binary PLY with normals, `residual` and `views`, the number of views that support a point.
 
-    Of a cloud in a file never more than a part is in memory.
+    It is written in blocks of `_ROWS`, so that a memory-mapped cloud is never in memory as a whole.
     """
     names = (*_PLACE, "residual")
     layout = np.dtype([(name, "<f4") for name in names] + [("views", "<u2")])
@@ -85,16 +85,16 @@ def write_residuals(run: RunData, path: Path) -> None:
     import pyarrow.parquet as pq
 
     table = residual_table(run)
-    # Of numbers that never repeat a dictionary takes four times as long as they do, and more room.
+    # Dictionary encoding of numbers that never repeat takes four times as long as plain writing, and more room.
     repeated = [name for name in table.column_names if name not in _NUMBERS]
     pq.write_table(table, path, compression="zstd", use_dictionary=repeated)
 
 
 def residual_table(run: RunData) -> Any:
-    """Return one row per residual of the model, before the register stage moves single views, as a pyarrow.Table.
+    """Return a pyarrow.Table with a row per residual of the model, before the register stage moves single views.
 
-    `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
-    What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
+    `time_s` is NaN where unknown; a covariate with the name of another column becomes `covariate_NAME`. Scalars of the
+    clouds, such as intensity, are columns too: NAME of the view's point, `partner_NAME` of its partner's.
     """
     pa = arrow_alone()
     session = _without_reserved_covariates(run.session)
@@ -109,7 +109,12 @@ def residual_table(run: RunData) -> Any:
 
 
 def _joined(pa: Any, parts: Sequence[Array]) -> Any:
-    """Return one column of parts; of names that are the same all over a part each is encoded once."""
+    """Return arrays, one a pair of views, joined to one pyarrow column; strings become a dictionary-encoded one.
+
+    Args:
+        pa: the module pyarrow.
+        parts: numbers, or names; names repeated by `np.broadcast_to` have stride 0 and are encoded only once.
+    """
     if not parts or parts[0].dtype.kind != "U":
         return pa.array(np.concatenate(parts))
     encoded = [
@@ -122,7 +127,7 @@ def _joined(pa: Any, parts: Sequence[Array]) -> Any:
 
 
 def _without_reserved_covariates(session: SessionData) -> SessionData:
-    """Return the session without covariates that would take the place of a column."""
+    """Return the session with covariates and scalars of clouds renamed where they are called like a column."""
 
     def free(values: dict[str, Any]) -> dict[str, Any]:
         return {f"covariate_{key}" if key in _RESERVED_COLUMNS else key: value for key, value in values.items()}
@@ -135,7 +140,13 @@ def _without_reserved_covariates(session: SessionData) -> SessionData:
 
 
 def _columns(session: SessionData, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
-    """Return columns of one pair of views, a row per correspondence."""
+    """Return columns of one pair of views, a row per correspondence; numbers that are unknown are NaN.
+
+    Args:
+        m: the correspondences: M points, indices in both clouds, residuals (length_unit), reference frame.
+        of_views: names of covariates.
+        of_points: names of the clouds' scalars.
+    """
     size = len(m.residual)
     view, partner = session.views[m.v], session.views[m.w]
     columns = {
@@ -148,6 +159,7 @@ def _columns(session: SessionData, m: Match, of_views: Iterable[str], of_points:
     }
     for key in sorted(of_points):
         for name, side, index in ((key, view, m.index_v), (f"partner_{key}", partner, m.index_w)):
+            # A scalar called like a covariate takes its column where the cloud has it.
             if side.cloud is not None and key in side.cloud.scalars:
                 columns[name] = side.cloud.scalars[key][index]
             else:
@@ -157,9 +169,9 @@ def _columns(session: SessionData, m: Match, of_views: Iterable[str], of_points:
 
 @contextmanager
 def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Iterator[Path]:
-    """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
+    """Yield a scratch folder: it replaces the run folder `path` if the block succeeds, and is deleted if it fails.
 
-    Of what stands there, only what a run wrote goes; a person's own files stay.
+    Only files of an earlier run are replaced; other files in the folder stay.
 
     Args:
         sessions: folders of the sessions that are run.
@@ -175,8 +187,11 @@ def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Ite
 
 @contextmanager
 def replace_run_files(path: Path) -> Iterator[Path]:
-    """A scratch folder whose files take the place of all that was made of the old model if the block succeeds; the old
-    fit is kept for `restore_fit`."""
+    """Yield a scratch folder: its files replace those of the run in `path` if the block succeeds.
+
+    The replaced files are kept in a hidden folder, from which `restore_fit` takes them if the same effects are asked
+    for again.
+    """
     with rewrite_folder(path, is_run_file(path)) as scratch:
         yield scratch
         # A file system without links keeps none.
@@ -185,9 +200,10 @@ def replace_run_files(path: Path) -> Iterator[Path]:
 
 
 def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
-    """Give a run the fit with these effects that it has had before, as a further step of its ledger.
+    """Replace a run's files by those of an earlier fit with these effects, and return whether there was one.
 
-    False where none is kept, or only one without the recording that is asked for.
+    The ledger goes on: it gets a further step. An earlier fit without recording.rrd does not count if `recording` asks
+    for that.
 
     Raises:
         InputError: another process writes there.
@@ -206,9 +222,10 @@ def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
 
 
 def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
-    """Return where the fit of a run's session with these effects is kept.
+    """Return the folder in which a run's fit with these effects is kept, whether it is there or not.
 
-    None where the session or the model is not what was fitted, and for effects of a user's own file, which may change.
+    Its name is a hash of what the fit depends on: stitch's version, the effects, sizes and times of the measured files.
+    None where session or model.toml changed after the fit, and for effects of a user's file, which may change.
     """
     try:
         document = json.loads((path / "result.json").read_text(encoding="utf-8"))
@@ -227,7 +244,10 @@ def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
 
 
 def _keep_fit(path: Path, scratch: Path) -> None:
-    """Link the fits that a run keeps, and the one that it has, into the folder that takes its place."""
+    """Fill the scratch folder's store of fits: those that the run folder `path` keeps, and its present fit.
+
+    Hard links take no room. The oldest fits are deleted once all together exceed `_KEPT_BYTES`.
+    """
     if (path / FITS).is_dir():
         shutil.copytree(path / FITS, scratch / FITS, copy_function=os.link)
     if (place := _place_of_fit(path, read_model(path).effects)) is not None:
@@ -246,7 +266,9 @@ def _keep_fit(path: Path, scratch: Path) -> None:
 
 @contextmanager
 def lock_run_folder(path: Path) -> Iterator[None]:
-    """Hold a run folder as its only writer, from reading it to writing into it.
+    """Let no other process write into a run folder while the block reads and writes it.
+
+    Nothing is locked where its parent folder does not exist: reading then says what is wrong.
 
     Raises:
         InputError: another process writes there, or its folder of pictures is a link to elsewhere.
@@ -261,14 +283,21 @@ def lock_run_folder(path: Path) -> Iterator[None]:
 
 
 def call_entry_points(group: str, *arguments: Any, required: bool = False) -> None:
-    """Call what other packages offer under an entry-point group; unless required, what lacks a package is left out."""
+    """Call every function that installed packages offer under an entry-point group, with these arguments.
+
+    Args:
+        required: a missing package is an error; otherwise the function that needs it is left out with a warning.
+    """
     for entry in entry_points(group=group):
         with nullcontext() if required else unless_missing():
             entry.load()(*arguments)
 
 
 def preload_entry_points(*groups: str) -> None:
-    """Load beside the fit what `extend` calls after it: it leaves a core idle, and drawing takes a second to load."""
+    """Load the functions of entry-point groups in a further thread, and return at once.
+
+    They are called after the fit, which leaves a core idle; loading the libraries that draw takes a second.
+    """
 
     def load() -> None:
         # What fails here fails again where it is called, and is said there.
@@ -295,7 +324,10 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
 
 
 def write_numbers(run: RunData, folder: Path) -> None:
-    """Write model.toml, result.json and ledger.json into `folder`; of several scanners those of each beside."""
+    """Write model.toml, result.json and ledger.json into `folder`.
+
+    A run of several scanners also gets a folder a session, in which they are those of its scanner alone.
+    """
     write_model_with_effects(run, folder)
     document = result_document(run)
     steps = ledger(run)

@@ -33,7 +33,10 @@ def number(value: float | None) -> float:
 
 @dataclass(frozen=True)
 class Kind:
-    """What a value may be, how it is written and how it is read."""
+    """A type of values in a document: its JSON Schema, how a value is written as JSON, and how it is read back.
+
+    An empty schema means that stitch only writes the value and never reads it again.
+    """
 
     schema: Schema
     write: Callable[[Any], Any] = plain
@@ -48,7 +51,11 @@ COUNT = Kind({"type": "integer", "minimum": 0})
 
 
 def list_of(kind: Kind, length: int | None = None) -> Kind:
-    """Return the kind of a list, read as a tuple."""
+    """Return the kind of a list with items of one kind, read as a tuple.
+
+    Args:
+        length: number of items; None: any.
+    """
     exact = {} if length is None else {"minItems": length, "maxItems": length}
     return Kind(
         {"type": "array", "items": kind.schema, **exact},
@@ -58,7 +65,7 @@ def list_of(kind: Kind, length: int | None = None) -> Kind:
 
 
 def table_of(kind: Kind) -> Kind:
-    """Return the kind of an object with any keys."""
+    """Return the kind of a JSON object with any keys and values of one kind, read as a dictionary."""
     return Kind(
         {"type": "object", "additionalProperties": kind.schema},
         lambda values: {key: kind.write(value) for key, value in values.items()},
@@ -67,7 +74,7 @@ def table_of(kind: Kind) -> Kind:
 
 
 def array_of(*shape: int) -> Kind:
-    """Return the kind of an array of this shape, read as floats."""
+    """Return the kind of an array of this shape, nested lists in JSON, read as an array of float64."""
     kind = NUMBER
     for length in reversed(shape):
         kind = list_of(kind, length)
@@ -103,7 +110,7 @@ class Document:
 
     @property
     def schema(self) -> Schema:
-        """JSON Schema that a document has to match before it is read."""
+        """JSON Schema that a document has to match before it is read; keys that are never read are not in it."""
         checked = [key for key in self.keys if key.kind.schema]
         return {
             "type": "object",
@@ -112,7 +119,7 @@ class Document:
         }
 
     def write(self, source: Any) -> dict[str, Any]:
-        """Return the document of its source."""
+        """Return the document of an object: each key holds what `write`, or else the attribute, gives of it."""
         return {
             key.name: key.kind.write((key.write or attrgetter(key.attribute or key.name))(source))
             for key in self.keys
@@ -120,10 +127,13 @@ class Document:
         }
 
     def fields(self, document: dict[str, Any], of: type | None = None) -> dict[str, Any]:
-        """Return the values that a document has for the fields of a class, by their names.
+        """Return what a document holds for the fields of a class, read, by the names of the fields.
+
+        A key that is optional or conditional may be absent; then its field is too, and the class has a default.
 
         Args:
-            of: the class, where a document fills several.
+            document: JSON that matches the schema.
+            of: the class; only keys with this class in `Key.of` are read. None: keys without one.
         """
         return {
             (key.attribute or key.name).rpartition(".")[2]: key.kind.read(document[key.name])
@@ -145,7 +155,7 @@ class Document:
 
 
 def read_checked(file: Path, schema: Schema) -> Any:
-    """Return what a JSON file of a run folder holds.
+    """Return what a JSON file of a run folder holds, checked by a JSON Schema.
 
     Raises:
         InputError: no run folder, no JSON, or an entry of another kind than stitch writes.
@@ -156,7 +166,8 @@ def read_checked(file: Path, schema: Schema) -> Any:
     from jsonschema.validators import extend
 
     def items(validator: Any, items: Any, values: Any, schema: Any) -> Iterator[Any]:
-        # Nearly all of a result are numbers in lists: one by one they take as long as the session takes to be read.
+        """Check the items of a list as jsonschema does, but a list of numbers at once."""
+        # Most of a result are numbers: checked one by one they take as long as reading the whole session.
         all_numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
         if not (items == NUMBER.schema and all_numbers):
             yield from Draft202012Validator.VALIDATORS["items"](validator, items, values, schema)

@@ -52,10 +52,10 @@ def pose_columns(T: Array) -> dict[str, Array]:
 
 
 def write_session(folder: Path, session: SessionFiles, check: Callable[[Path], None] | None = None) -> None:
-    """Write one session into the new folder, with everything or not at all.
+    """Write one session into a new folder, completely or not at all.
 
     Args:
-        check: is asked about the folder before it takes its name; what it raises leaves none.
+        check: is called with the scratch folder once all is written; if it raises, no folder is left.
 
     Raises:
         InputError: the folder exists and is not empty.
@@ -81,7 +81,7 @@ def write_sessions(folder: Path, sessions: Sequence[SessionFiles]) -> None:
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A scratch folder that takes the place of `folder` if the block succeeds, and goes if it fails.
+    """Yield a scratch folder beside `folder`: it gets that name if the block succeeds, and is deleted if it fails.
 
     Raises:
         InputError: the folder exists and is not empty.
@@ -102,7 +102,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def _write(folder: Path, session: SessionFiles) -> None:
-    """Write the files of a session into a folder."""
+    """Write the files of a session into a folder, which is made if it does not exist."""
     folder.mkdir(exist_ok=True)
     head = {"format": SESSION_FORMAT, "name": session.name, "length_unit": session.length_unit, "mount": session.mount}
     (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
@@ -122,8 +122,12 @@ def _write(folder: Path, session: SessionFiles) -> None:
 
 
 def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
-    """Write one scan as binary PLY: places and normals in double precision, its scalars as `scalar` says."""
-    # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
+    """Write one scan as binary PLY: points and normals in double precision, scalars in that of `scalar`.
+
+    Args:
+        scalar: NumPy type of each scalar, "<f4" or "<f8".
+    """
+    # Single precision would round to 30 nm at half a metre: all results depend on the points.
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.T, strict=True))
@@ -140,10 +144,11 @@ def write_table(file: Path, columns: TableColumns, exact: bool = False) -> None:
 
 
 def table_text(columns: TableColumns, exact: bool = False) -> str:
-    """Return a table as CSV.
+    """Return a table as CSV; floats with 12 digits.
 
     Args:
-        exact: numbers read back as they are, and one that is not known is an empty cell.
+        columns: values by name, all columns equally long.
+        exact: floats with all digits, so that they read back unchanged; one that is not finite is an empty cell.
     """
 
     def cell(value: object) -> object:
@@ -159,7 +164,10 @@ def table_text(columns: TableColumns, exact: bool = False) -> str:
 
 
 def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
-    """Return the rows of [robot] joints in session.toml, angles in degrees; None for an arm that came as URDF."""
+    """Return the Denavit-Hartenberg rows of [robot] in session.toml, one a joint: angles in degrees, length_unit, kg.
+
+    None for a robot that was read from a URDF, which has no such rows.
+    """
     if robot.a is None or robot.alpha is None or robot.d is None:
         return None
     rows = []
@@ -177,10 +185,11 @@ def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = (), stated: StatedRepeatability | None = None) -> str | None:
-    """Return the [robot] table of session.toml below lines of comment; None for an arm that came as URDF.
+    """Return the [robot] table of session.toml as text; None for a robot that was read from a URDF.
 
     Args:
-        stated: repeatability that the nominal table has; a table that takes its place says the same.
+        comments: lines above the table.
+        stated: repeatability of the robot, which the table states too; None: it does not.
     """
     rows = dh_rows(robot)
     if rows is None:
@@ -191,7 +200,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = (), stated: StatedRepeata
         "gravity": robot.gravity.tolist(),
         "joints": rows,
     }
-    # Without a mass the centre is that of the column payload_kg.
+    # The column payload_kg of views.csv may state the mass; its centre is in this table all the same.
     if robot.payload_mass or not robot.carries_at_flange:
         table["payload"] = {"mass": robot.payload_mass, "com": robot.payload_com.tolist()}
     if stated is not None and (repeatability := repeatability_table(stated)):

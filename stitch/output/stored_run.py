@@ -69,7 +69,7 @@ def read_ledger(folder: Path) -> list[dict[str, Any]]:
 def trusted_model(
     path: Path, effects_file: Path | None = None, trust: bool = False, result: dict[str, Any] | None = None
 ) -> tuple[ModelFile, str | None]:
-    """Return the model, and the absolute path of the file whose effects have joined the library, if any.
+    """Return the model, and the absolute path of the Python file whose effects were loaded for it; None: no file.
 
     Args:
         path: run folder, or model.toml.
@@ -102,7 +102,11 @@ def trusted_model(
 
 
 def _covariance_beside(path: Path, result: dict[str, Any] | None) -> EffectsCovariance:
-    """Return what the result beside a model.toml, of a run or of a rig, says of its effects' parameters."""
+    """Return the covariance of the effects' parameters from the result.json beside a model.toml.
+
+    The folder of several sessions has a result.json in each inner folder: the first one is taken, since they share
+    their effects. Without a file the covariance is empty.
+    """
     folder = path if path.is_dir() else path.parent
     files = [folder / "result.json", *sorted(folder.glob("*/result.json"))]
     file = next((file for file in files if file.is_file()), None)
@@ -127,6 +131,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         raise InputError(f"{folder}/result.json: its session {gone} has gone; to fix: restore it or correct the path")
     parts = [with_model_axes(load_session(path), file) for path in paths]
     session = join_sessions(with_model_scanners(parts, file)) if len(parts) > 1 else parts[0]
+    # The order is that of a run: views, model, points that count, gate, stock. Each needs those before it.
     with library_threads_off():
         measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
         left_out = results.excluded_views(document)
@@ -138,7 +143,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         capture = corrected_capture(measurement, model)
         gate = gate_of_model(capture, model.T_mount)
         if stock := results.stock_of_views(document, session.names):
-            # Of what was taken off, where it was is found again.
+            # The result states thickness and sigma of the stock; its points are found again.
             stock = locate_stock(session, capture, model.T_mount, gate, stock)
             measurement = replace(measurement, capture=measurement.capture.without_stock(stock))
             gate = gate_of_model(capture.without_stock(stock), model.T_mount)
@@ -174,14 +179,17 @@ def read_diagnosis(folder: Path) -> dict[str, Any]:
 
 
 def standing_diagnosis(folder: Path, run: RunData) -> dict[str, Any]:
-    """Return the diagnosis in a run's folder; {} where there is none, or one of another state or version."""
+    """Return diagnosis.json of a run folder if it is of this very run; else {}.
+
+    It is outdated when session, model, effects' file or the version of stitch changed since.
+    """
     document = _whole_diagnosis(folder)
     state = diagnosed_state(run, folder) if document else UNKNOWN
     return document if UNKNOWN not in state and document.get("of") == state else {}
 
 
 def _whole_diagnosis(folder: Path) -> dict[str, Any]:
-    """Return the diagnosis in a run's folder; {} for a damaged one: it is soon written anew."""
+    """Return diagnosis.json of a run folder; {} where there is none, or a damaged one, which a diagnosis replaces."""
     try:
         return read_diagnosis(folder)
     except InputError:
@@ -189,7 +197,10 @@ def _whole_diagnosis(folder: Path) -> dict[str, Any]:
 
 
 def diagnosed_state(run: RunData, folder: Path) -> str:
-    """Return what a diagnosis is of: stitch's version, and hashes of the session, the result and the effects' file."""
+    """Return an identification of what is diagnosed, to compare with the entry `of` of diagnosis.json.
+
+    It consists of stitch's version and hashes of the session, the run's model and result, and the effects' file.
+    """
     result = content_hash(folder, [folder / "model.toml", folder / "result.json"])
     file = None if run.effects_file is None else Path(run.effects_file)
     effects = "" if file is None else content_hash(file.parent, [file])
@@ -217,7 +228,7 @@ def fused_cloud(path: Path) -> FusedCloud:
 
 
 def _read_fit(folder: Path, run: RunData) -> Fit:
-    """Return what the stages found; correspondences are found again, nothing is fitted.
+    """Return the results of a stored run's stages; correspondences are searched again, nothing is fitted.
 
     Raises:
         InputError: a file of the folder is damaged, or belongs to another model or session.
@@ -233,7 +244,11 @@ def _read_fit(folder: Path, run: RunData) -> Fit:
 
 
 def _require_same(folder: Path, document: dict[str, Any], model: ModelFile, run: RunData) -> None:
-    """Refuse a model or a session that is not that of the result any more."""
+    """Refuse a run whose model.toml or views.csv was changed after result.json was written.
+
+    Raises:
+        InputError: says which of the two, and what to do.
+    """
     if not results.has_model(document, model):
         raise InputError(
             f"{folder}/model.toml: changed after the run; see what it does with `stitch run {run.session.path} "
@@ -249,7 +264,7 @@ def _fused_views(document: dict[str, Any], run: RunData) -> list[results.ViewRow
 
 
 def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
-    """Return the fit of a stored run, with its correspondences searched anew where it left them.
+    """Return the fit of a stored run, with its correspondences searched again at its final poses.
 
     Args:
         document: result.json.
@@ -280,7 +295,10 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
 
 
 def _target_fit(folder: Path, run: RunData) -> TargetModelFit:
-    """Return what the labelled points say under the model; the distances of views left out are those of the fit."""
+    """Return the labelled points evaluated under the model.
+
+    Distances on views left out would need fits: they are read from residuals.parquet.
+    """
     from pyarrow.parquet import read_table
 
     fit = evaluate_targets(run.measurement, run.model)

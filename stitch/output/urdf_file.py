@@ -11,17 +11,18 @@ from stitch.session.robot import Robot, elementary
 
 
 def to_urdf(robot: Robot) -> str:
-    """Return the chain base_link, link_1 … link_n, flange as URDF text: the same flange pose for every joint angle.
+    """Return a robot as URDF text, links base_link, link_1 … link_n, flange; its flange poses are those of the robot.
 
-    Masses are written as point masses; the payload is a link of its own fixed to the flange, so a reader
-    of the file must not add it again.
+    T_base_flange(q) = Π before[i] · Rz(theta[i] + q[i]) · after[i]. Masses are point masses. The payload is a further
+    link fixed to the flange, so that a reader of the file must not add it again.
     """
     root = ElementTree.Element("robot", name=robot.name or "robot")
     ElementTree.SubElement(root, "link", name="base_link")
+    # `carried` is the part of the transform behind the last joint, which the next joint's origin takes up.
     parent, carried = "base_link", np.eye(4)
     for i in range(robot.n_joints):
         origin = carried @ robot.before[i] @ elementary("z", robot.theta[i])
-        # A link's frame sits right behind its joint here, before `after`, which the next origin takes up.
+        # In URDF a link's frame is that of its joint; `com` is given in the frame behind `after`.
         centre = frames.transform(robot.after[i], robot.com[i][None])[0] * robot.metres_per_unit
         link = f"link_{i + 1}"
         _add_link(root, link, float(robot.mass[i]), centre)
@@ -50,7 +51,14 @@ def _add_link(root: ElementTree.Element, name: str, mass: float, com: Array) -> 
 def _add_joint(
     root: ElementTree.Element, name: str, kind: str, parent: str, child: str, T: Array, metres: float
 ) -> None:
-    """Add a joint between two links; T (4, 4) is its frame in the parent, `metres` the length of its unit."""
+    """Add a joint between two links; it turns about z.
+
+    Args:
+        kind: "continuous" or "fixed".
+        parent, child: names of the links.
+        T: (4, 4) T_parent_joint, length_unit.
+        metres: metres per length_unit.
+    """
     joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "origin", xyz=_text(T[:3, 3] * metres), rpy=_text(roll_pitch_yaw(T[:3, :3])))
     ElementTree.SubElement(joint, "parent", link=parent)
@@ -60,10 +68,10 @@ def _add_joint(
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """Return (3,) with R = Rz(yaw)·Ry(pitch)·Rx(roll), exact at and near a pitch of 90° too.
+    """Return (3,) roll, pitch and yaw (rad) of a rotation R (3, 3): R = Rz(yaw)·Ry(pitch)·Rx(roll).
 
-    There yaw alone is ill-determined; roll is read from what remains after the yaw that was chosen,
-    so that an error of one undoes that of the other.
+    It is exact near a pitch of 90° too: yaw is arbitrary there, but roll is read from Rz(−yaw)·R, so that an error of
+    yaw is undone by roll.
     """
     yaw = np.arctan2(R[1, 0], R[0, 0])
     rest = elementary("z", -yaw)[:3, :3] @ R
