@@ -118,7 +118,7 @@ def correct(
         unconstrained_poses(c, c.poses(T_mount), gate, o) for c, gate, o in zip(captures, gates, overlaps, strict=True)
     )
     T_first, scatters = step_hand_eye(captures, unconstrained, T_mount)
-    _check_distance(captures, T_first)
+    require_near_scanner(captures, T_first)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
     # Where clouds now weigh otherwise beside labelled points, the views are moved anew.
@@ -127,7 +127,7 @@ def correct(
         for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
     solved = solve_hand_eye(captures, unconstrained, T_first)
-    _check_distance(captures, solved.T_mount)
+    require_near_scanner(captures, solved.T_mount)
 
     def statistics() -> HandEyeFit:
         common = None if scanner_errors is None else scanner_errors(unconstrained)
@@ -150,7 +150,7 @@ def correct(
     )
 
 
-def _check_distance(captures: Sequence[Capture], T_mount: Array) -> None:
+def require_near_scanner(captures: Sequence[Capture], T_mount: Array) -> None:
     """Refuse a hand-eye whose scanner lies implausibly far from the flange: the fit has run away.
 
     Raises:

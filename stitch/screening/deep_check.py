@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from stitch.errors import InputError, NoResultError
 from stitch.fit.coarse import find_coarse_hand_eye
-from stitch.fit.correct import icp_hand_eye
+from stitch.fit.correct import icp_hand_eye, require_near_scanner
 from stitch.model.model import Model
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.view_poses import unconstrained_poses
@@ -142,6 +142,7 @@ def _starting_hand_eye(session: SessionData, capture: Capture, ranked: Sequence[
 def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, gate: float) -> tuple[Array, Snooping]:
     """Return the hand-eye refined from a start, and what snooping finds under it."""
     T_mount, overlaps, _ = icp_hand_eye([capture], T_mount, [gate])
+    require_near_scanner([capture], T_mount)
     gate = overlaps[0].gate
     unconstrained = unconstrained_poses(capture, capture.poses(T_mount), gate)
     usual = UsualEffects(measurement_of(session, capture), Model(T_mount))

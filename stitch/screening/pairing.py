@@ -97,9 +97,9 @@ def _single_view_problem(
     names = session.names
     name = names[m.view]
     scan = capture.scans[m.view]
-    if m.kind != "several" and not shows_no_surface(scan):
+    others = [v for v in snooping.linkage.core if v != m.view]
+    if others and m.kind != "several" and not shows_no_surface(scan):
         # Something may be wrong with the cloud rather than with its pose.
-        others = [v for v in snooping.linkage.core if v != m.view]
         surface = surface_of(capture.scans, snooping.unconstrained.poses, others, snooping.tolerance)
         look = scan_fault if m.T is None else scale_fault
         fault = look(scan, snooping.expected[m.view], surface, part_size([capture]), snooping.needed)
@@ -166,10 +166,10 @@ def find_fitting_rows(
     """Return for every misplaced scan that fits the part the row to whose pose it belongs; None for no other row."""
     rows = {m.view: _nearest_row(capture, snooping.expected, m.view, m.T) for m in misplaced if m.T is not None}
     elsewhere = [view for view, row in rows.items() if row is None]
-    if not elsewhere or len(misplaced) < 2:
+    core = [v for v in snooping.linkage.core if v not in snooping.not_belonging]
+    if not elsewhere or not core or len(misplaced) < 2:
         return rows
     # Where scans slide along the part, each came to rest somewhere else than in the row where it would fit as well.
-    core = [v for v in snooping.linkage.core if v not in snooping.not_belonging]
     surface = surface_of(capture.scans, snooping.unconstrained.poses, core, snooping.tolerance)
     every = [m.view for m in misplaced]
     return rows | {v: _row_where_it_fits(capture, snooping, surface, v, every) for v in elsewhere}

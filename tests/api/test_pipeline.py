@@ -267,3 +267,10 @@ def test_what_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(kind, vie
     job = degenerate.drawn(7) | {"kind": kind, "views": views, "traits": traits, "checked": False}
     outcome = degenerate.trial(job)
     assert outcome["crashes"] == [] and (outcome["result"] or outcome["refused"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [20286, 20421, 21224])
+def test_a_draw_that_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(seed):
+    outcome = degenerate.trial(degenerate.jobs([seed])[0])
+    assert outcome["crashes"] == [] and (outcome["result"] or outcome["refused"])

@@ -320,11 +320,12 @@ class NeighbourQueries:
             gate: largest distance between corresponding points, length_unit.
         """
         tree, reach = self.scans[w].tree, _REACH * gate
-        distance, index = tree.query(self._seen_from(w, points), k=min(2, tree.n), distance_upper_bound=reach)
-        first, second = distance.reshape(len(points), -1).T[[0, -1]]
+        count = min(2, tree.n)
+        distance, index = tree.query(self._seen_from(w, points), k=count, distance_upper_bound=reach)
+        first, second = distance.reshape(-1, count).T[[0, -1]]
         # A point beyond the gate has no partner until it has moved back into it.
         lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
-        return Nearest(self._usable(w, index.reshape(len(points), -1)[:, 0]), lead.astype(np.float32))
+        return Nearest(self._usable(w, index.reshape(-1, count)[:, 0]), lead.astype(np.float32))
 
     def partners(self, w: int, points: Array, gate: float) -> NDArray[np.int32]:
         """Return the usable points (N,) of view w nearest to points (N, 3) of the reference frame, -1 for none."""
