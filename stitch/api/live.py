@@ -32,7 +32,7 @@ from stitch.recorder import Recorder, SilentRecorder
 from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
 from stitch.screening.view_model import UsualEffects, ViewModel, view_model
 from stitch.screening.view_screening import fit_screened_views
-from stitch.session.axis_poses import as_stated, axes_of, place_axes, require_placed
+from stitch.session.axis_poses import axes_of, place_axes, place_stated_axes, require_placed
 from stitch.session.capture import Capture, build_capture, prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_toml import read_axes
@@ -529,7 +529,7 @@ def live(
         (True, True)
     """
     session = Session.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
-    placed = as_stated(
+    placed = place_stated_axes(
         session, read_axes(session.path / "session.toml", [dict(t) for t in axes], mount, has_poses=True)
     )
     require_placed(placed)

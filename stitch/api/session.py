@@ -27,7 +27,7 @@ from stitch.output.session_files import (
 )
 from stitch.output.urdf_file import to_urdf
 from stitch.screening.deep_check import refuse_whole
-from stitch.session.axis_poses import as_stated, axis_tables, reported_poses
+from stitch.session.axis_poses import axis_tables, place_stated_axes, reported_poses
 from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, seconds_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
@@ -354,7 +354,7 @@ def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session
                     f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with "
                     f"{' or '.join(columns)}, one number a view"
                 )
-    return public_session(as_stated(session, axes)) if axes else session
+    return public_session(place_stated_axes(session, axes)) if axes else session
 
 
 def _measured_views(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[View]:

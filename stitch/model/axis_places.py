@@ -75,7 +75,7 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
             [(_as_stated(measurement, *_moved(model, term, step), k, near) - here) / _STEP for step in steps]
         ).reshape(len(steps), 6)
         sigma = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", J, covariance, J), 0.0))
-        hidden, unknown = _unseen(axis, term, alone=not axes.has_robot, is_own=k == axes.own)
+        hidden, unknown = _unseen(axis, term, alone=not axes.has_robot, is_own=k == axes.frame_axis)
         sigma[:3][hidden[0]] = np.nan
         sigma[3:][hidden[1]] = np.nan
         places.append(

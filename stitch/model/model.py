@@ -208,7 +208,7 @@ def geometry_terms(measurement: Measurement) -> tuple[Term, ...]:
     if not axes:
         return scanners
     term = term_of(measurement, find_effect(PLACEMENT))
-    still = {axis.name for k, axis in enumerate(axes.axes) if axis.is_fixed or k == axes.own}
+    still = {axis.name for k, axis in enumerate(axes.axes) if axis.is_fixed or k == axes.frame_axis}
     # One that is used as given is held as what another run knows is.
     parameters = [replace(p, kept=p.name.partition("_")[2] in still) for p in term.parameters]
     return (Term(term.effect, tuple(parameters)), *scanners)

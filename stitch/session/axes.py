@@ -43,21 +43,21 @@ class Axis:
 
     @property
     def is_placed(self) -> bool:
-        """True if it is known from where to start."""
+        """True if direction, and point of a rotary axis, are known: at least a start for the fit."""
         return self.direction is not None and (self.point is not None or not self.is_rotary)
 
     def columns(self, length_unit: str) -> dict[str, float]:
-        """Return the columns of views.csv in which its readings may stand, and how much one of them is."""
+        """Return the columns of views.csv that may hold its readings -> factor to rad or length_unit."""
         if self.is_rotary:
             return {f"{self.name}_deg": np.pi / 180}
         return {f"{self.name}_{unit}": metres / METRES[length_unit] for unit, metres in METRES.items()}
 
     @property
     def frame(self) -> Array:
-        """(4, 4) with z along the axis, about which errors of the axis are counted."""
+        """T_base_axis (4, 4) of a placed axis: z along its direction, the origin at its point, or the base's origin."""
         assert self.direction is not None
         z = self.direction
-        # The world's axis that is farthest from it: a table's frame stands as the base's.
+        # x close to the axis of the base that is most across z: a table of vertical axis has the base's directions.
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
         x = x - z * (x @ z)
         x = x / np.linalg.norm(x)
@@ -66,12 +66,12 @@ class Axis:
 
 @dataclass(frozen=True)
 class AxisMotion:
-    """How K axes move in V views: effects change it."""
+    """How K axes move in V views, errors included: effects of the model change it."""
 
     readings: Array  # (V, K) rad or length_unit
-    placement: Array  # (K, 6) twist of the axis in its frame
+    placement: Array  # (K, 6) twist of the axis from its stated place, axis frame
     along: Array  # (K, 3) rad by which a carriage turns per length_unit of its way, axis frame
-    error: Array  # (V, K, 6) twist beside the axis' own motion, axis frame
+    error: Array  # (V, K, 6) twist in addition to the axis' own motion, axis frame
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Axes:
 
     axes: tuple[Axis, ...] = ()
     readings: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) rad or length_unit
-    approach: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) −1, 0, +1
+    approach: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) −1, 0, +1: sign of the last move
     has_robot: bool = True
     length_unit: str = "mm"
 
@@ -98,8 +98,11 @@ class Axes:
         return 1 / METRES[self.length_unit]
 
     @property
-    def own(self) -> int:
-        """Index of the axis whose frame is that of the others, where there is no robot; −1 with one."""
+    def frame_axis(self) -> int:
+        """Index of the axis in whose frame all are given where there is no robot: the first rotary one, else the first.
+
+        −1 with a robot: then all are given in its base frame.
+        """
         if self.has_robot or not self.axes:
             return -1
         return next((k for k, axis in enumerate(self.axes) if axis.is_rotary), 0)
@@ -110,16 +113,23 @@ class Axes:
         return all(axis.is_placed for axis in self.axes)
 
     def stands_right(self, axis: Axis) -> bool:
-        """Return whether an axis is a factor of A_right."""
+        """Return True if an axis is a factor of A_right in T_base_flange' = A_left⁻¹ · A_right · T_base_flange."""
         return axis.carries == ("robot" if self.has_robot else "part")
 
     def as_read(self) -> AxisMotion:
-        """Return the motion without errors."""
+        """Return the motion by the readings alone, without errors."""
         V, K = self.readings.shape
         return AxisMotion(self.readings, np.zeros((K, 6)), np.zeros((K, 3)), np.zeros((V, K, 6)))
 
     def sides(self, motion: AxisMotion | None = None) -> tuple[Array, Array]:
-        """Return A_left and A_right, (V, 4, 4) each; an axis that nobody has placed yet stands still in them."""
+        """Return A_left and A_right (V, 4, 4) of T_base_flange' = A_left⁻¹ · A_right · T_base_flange, base frame.
+
+        Each is the product F·exp(error)·exp(motion)·F⁻¹ of its axes, with F = T_base_axis. An axis whose place is not
+        known yet counts as standing still.
+
+        Args:
+            motion: None: as read, without errors.
+        """
         motion = motion or self.as_read()
         count = len(motion.readings)
         left = np.tile(np.eye(4), (count, 1, 1))
@@ -136,37 +146,37 @@ class Axes:
         return left, right
 
     def _screw(self, motion: AxisMotion, k: int) -> Array:
-        """Return the twists (V, 6) by which an axis moves, in its frame."""
+        """Return the twists (V, 6) of axis k by its readings: about or along z of its frame, with a carriage's tilt."""
         twist = np.zeros((len(motion.readings), 6))
         twist[:, 2 if self.axes[k].is_rotary else 5] = motion.readings[:, k]
         twist[:, :3] += motion.readings[:, k, None] * motion.along[k]
         return twist
 
     def carried(self, motion: AxisMotion | None = None) -> Array:
-        """Return A_left⁻¹ · A_right (V, 4, 4), by which T_base_flange becomes the effective one."""
+        """Return A_left⁻¹ · A_right (V, 4, 4): multiplied from the left it makes T_base_flange the effective pose."""
         left, right = self.sides(motion)
         return frames.inverse(left) @ right
 
     def correction(self, motion: AxisMotion) -> Array:
-        """Return (V, 4, 4) from the left by which the effective poses change where the axes move otherwise."""
+        """Return (V, 4, 4), multiplied from the left, from the effective poses as read to those under `motion`."""
         return self.carried(motion) @ frames.inverse(self.carried())
 
     def only(self, keep: Sequence[int]) -> "Axes":
-        """Return the axes in some of the views."""
+        """Return the axes with the readings of some of the views, by index."""
         return take_rows(self, list(keep), "readings", "approach")
 
     def standing(self, count: int) -> "Axes":
-        """Return the axes in so many views in which they stand as in the last one."""
+        """Return the axes for `count` further views in which they stand where they do in the last view."""
         approach = np.zeros((count, len(self.axes)))
         return replace(self, readings=np.repeat(self.readings[-1:], count, axis=0), approach=approach)
 
     def with_more(self, more: "Axes") -> "Axes":
-        """Return the axes in these views and then in others."""
+        """Return the axes with the readings of these views, followed by those of others."""
         readings = np.concatenate([self.readings, more.readings])
         return replace(self, readings=readings, approach=np.concatenate([self.approach, more.approach]))
 
     def placed(self, motion: AxisMotion) -> tuple[Axis, ...]:
-        """Return the axes where a placement puts them."""
+        """Return the axes with direction and point moved by the placement of a motion; all must be placed."""
         out = []
         for k, axis in enumerate(self.axes):
             F = axis.frame @ frames.exp(motion.placement[k])

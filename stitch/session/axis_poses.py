@@ -14,7 +14,10 @@ from stitch.session.session import SessionData
 
 
 def axes_of(session: SessionData) -> Axes:
-    """Return the axes of a session with their readings in its views."""
+    """Return the axes of a session with their readings and approach in its V views.
+
+    An approach that views.csv does not state is the sign of the change since the view before; 0 in the first.
+    """
     if not session.axes:
         return Axes()
     readings = np.array([axis_readings(session.axes, v.covariates, session.length_unit) for v in session.views])
@@ -27,13 +30,21 @@ def axes_of(session: SessionData) -> Axes:
 
 
 def axis_readings(axes: Sequence[Axis], covariates: Mapping[str, float], length_unit: str) -> Array:
-    """Return (K,) readings of one view, rad or length_unit, from its columns."""
+    """Return the readings (K,) of one view, rad or length_unit.
+
+    Args:
+        axes: K axes.
+        covariates: column of views.csv -> value; each axis has one of its columns among them.
+    """
     columns = [axis.columns(length_unit) for axis in axes]
     return np.array([next(covariates[c] * size for c, size in of.items() if c in covariates) for of in columns])
 
 
 def place_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData:
-    """Return the session with axes of the same names at another place, and the effective poses that follow."""
+    """Return the session with axes of the same names placed elsewhere, and with the effective poses that follow.
+
+    A view's T_base_flange holds the motion of the axes too: it is taken off with the old axes, and put on with the new.
+    """
     if not session.views:
         return replace(session, axes=tuple(axes))
     reported = reported_poses(session)
@@ -44,72 +55,82 @@ def place_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData:
 
 
 def reported_poses(session: SessionData) -> Array:
-    """Return T_base_flange (V, 4, 4) as the robot reports it, without the axes."""
+    """Return T_base_flange (V, 4, 4) as the robot reports it: the views' effective poses less the axes' motion."""
     T = np.array([view.T_base_flange for view in session.views])
     return frames.inverse(axes_of(session).carried()) @ T if session.axes else T
 
 
-def as_stated(session: SessionData, axes: Sequence[Axis]) -> SessionData:
-    """Return the session with its axes as session.toml states them, and the hand-eye that this states without a robot.
+def place_stated_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData:
+    """Return the session with the axes that session.toml states.
 
-    There they are given in the scanner's frame; they count in that of the first rotary axis at its zero.
+    With a robot they are given in its base frame, and stay in it. Without one session.toml gives them in the scanner's
+    frame; all that follows needs them in that of one axis, the frame axis (`Axes.frame_axis`), with z along it. Its
+    stated place is the hand-eye T_mount; where it is not known, the other axes become unplaced too.
 
     Raises:
-        InputError: place of the axis and of the scanner are both stated.
+        InputError: without a robot, the frame axis and `scanner.pose` both state where the scanner stands.
     """
     if session.has_poses or not axes:
         return place_axes(session, axes)
-    own = axes[Axes(tuple(axes), has_robot=False).own]
-    T_own_scanner = session.scanner.T_mount
-    if own.is_placed:
-        if T_own_scanner is not None:
+    frame_axis = axes[Axes(tuple(axes), has_robot=False).frame_axis]
+    T_axis_scanner = session.scanner.T_mount
+    if frame_axis.is_placed:
+        if T_axis_scanner is not None:
             raise InputError(
-                f"{session.path}: axis {own.name} and scanner.pose both state where the axis stands; to "
+                f"{session.path}: axis {frame_axis.name} and scanner.pose both state where the axis stands; to "
                 "fix: take one out"
             )
-        T_own_scanner = frames.inverse(own.frame)
-        session = replace(session, scanner=replace(session.scanner, T_mount=T_own_scanner))
+        T_scanner_axis = frame_axis.frame
+        T_axis_scanner = frames.inverse(T_scanner_axis)
+        session = replace(session, scanner=replace(session.scanner, T_mount=T_axis_scanner))
     placed = []
     for axis in axes:
-        if axis is own:
-            still = np.zeros(3) if axis.is_rotary else None
-            axis = replace(axis, direction=np.array([0.0, 0.0, 1.0]), point=still)
-        elif T_own_scanner is None:
+        if axis is frame_axis:
+            origin = np.zeros(3) if axis.is_rotary else None
+            axis = replace(axis, direction=np.array([0.0, 0.0, 1.0]), point=origin)
+        elif T_axis_scanner is None:
             axis = replace(axis, direction=None, point=None)
         elif axis.direction is not None:
-            point = None if axis.point is None else frames.transform(T_own_scanner, axis.point[None])[0]
-            axis = replace(axis, direction=T_own_scanner[:3, :3] @ axis.direction, point=point)
+            axis = _moved_axis(axis, T_axis_scanner)
         placed.append(axis)
     return place_axes(session, placed)
 
 
+def _moved_axis(axis: Axis, T_new_old: Array) -> Axis:
+    """Return an axis of known direction in another frame: T_new_old (4, 4) maps its present frame into that one."""
+    assert axis.direction is not None
+    point = None if axis.point is None else frames.transform(T_new_old, axis.point[None])[0]
+    return replace(axis, direction=T_new_old[:3, :3] @ axis.direction, point=point)
+
+
 def carried_last(session: SessionData) -> Array:
-    """Return (1, 4, 4) by which poses of the arm become effective ones where the axes stand as in the last view."""
+    """Return (1, 4, 4): multiplied from the left it makes a pose of the arm effective, the axes as in the last view."""
     return axes_of(session).standing(1).carried() if session.axes else np.eye(4)[None]
 
 
 def axis_tables(session: SessionData) -> list[dict[str, Any]]:
-    """Return the [[axis]] tables of a session, as `as_stated` reads them."""
+    """Return the [[axis]] tables of session.toml for a session, such that `place_stated_axes` gives its axes again.
+
+    Without a robot they are written in the scanner's frame, and without a place where the hand-eye is not known.
+    """
     tables = []
-    to_scanner = None
+    T_scanner_axis = None
     if not session.has_poses and session.scanner.T_mount is not None:
-        to_scanner = frames.inverse(session.scanner.T_mount)
+        T_scanner_axis = frames.inverse(session.scanner.T_mount)
     for axis in session.axes:
         table: dict[str, Any] = {"name": axis.name, "kind": axis.kind, "carries": axis.carries}
-        direction, point = axis.direction, axis.point
-        if to_scanner is not None and direction is not None:
-            direction = to_scanner[:3, :3] @ direction
-            point = None if point is None else frames.transform(to_scanner, point[None])[0]
-        if direction is not None and (session.has_poses or to_scanner is not None):
-            table["direction"] = direction.tolist()
-            table |= {} if point is None else {"point": point.tolist()}
+        if T_scanner_axis is not None and axis.direction is not None:
+            axis = _moved_axis(axis, T_scanner_axis)
+        if axis.direction is not None and (session.has_poses or T_scanner_axis is not None):
+            table["direction"] = axis.direction.tolist()
+            table |= {} if axis.point is None else {"point": axis.point.tolist()}
             table |= {"stated": True} if axis.is_fixed else {}
         tables.append(table)
     return tables
 
 
 def require_placed(session: SessionData) -> None:
-    """Refuse a session with an axis that nobody has placed, where it is not fitted.
+    """Refuse a session with an axis of unknown place, for commands that do not fit it.
 
     Raises:
         InputError: names the axis.

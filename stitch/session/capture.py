@@ -52,20 +52,23 @@ class Sightings:
 
     @property
     def view_counts(self) -> Indices:
-        """(K,) number of views that use each target."""
+        """(K,) number of views in which each target is used."""
         return np.bincount(self.target[self.used], minlength=len(self.targets)).astype(np.int64)
 
     @property
     def with_outliers(self) -> "Sightings":
-        """The same with the outliers back in."""
+        """The sightings with all points used that were seen, outliers included."""
         return replace(self, used=self.target >= 0)
 
     def points_by_view(self) -> list[Array]:
-        """Per view the points in use, (k, 3); none where it shows nothing."""
+        """Return per view the points in use (k, 3), sensor frame; (0, 3) where there is none."""
         return [points[used] for points, used in zip(self.points, self.used, strict=True)]
 
     def at_most(self, count: int) -> "Sightings":
-        """Return the sightings with so many points of each view, spread over its targets: of the next view others."""
+        """Return the sightings with at most `count` points of each view, spread evenly over its targets.
+
+        Each view begins one target later than the view before, so that all targets appear over the views.
+        """
         if count >= self.target.shape[1]:
             return self
         slots = np.full((len(self.target), count), -1)
@@ -80,7 +83,7 @@ class Sightings:
         return replace(self, target=target, points=points, sigma=self.sigma[rows, slots], used=used)
 
     def without(self, left_out: Indices) -> "Sightings":
-        """Return the sightings less some views."""
+        """Return the sightings without the views at the indices `left_out`."""
         keep = np.setdiff1d(np.arange(len(self.points)), left_out)
         return take_rows(self, keep, "target", "points", "sigma", "used", "rotation", "sigma_rotation")
 
@@ -131,14 +134,18 @@ class Capture:
 
     @property
     def point_sets(self) -> list[Array]:
-        """The same, (N, 3) each, of the views that show any."""
+        """The visible points (N, 3), scanner frame, of each view that has any: a list that may be shorter than V."""
         return [points for points in self.visible_points if len(points)]
 
     def seen_by(self, scanner: int) -> list[Array]:
-        """Return the points (N, 3) of the views of one of several scanners that show any; of all where there is one."""
+        """Return the visible points (N, 3), scanner frame, of each view of a scanner that has any.
+
+        Args:
+            scanner: its index; where the capture has a single scanner all views count.
+        """
         every = self.visible_points
-        own = self.scanner if self.scanner is not None else np.full(len(every), scanner)
-        return [points for points, k in zip(every, own, strict=True) if k == scanner and len(points)]
+        of_view = self.scanner if self.scanner is not None else np.full(len(every), scanner)
+        return [points for points, k in zip(every, of_view, strict=True) if k == scanner and len(points)]
 
     @property
     def spacing(self) -> float:
@@ -146,21 +153,29 @@ class Capture:
         return float(np.median([scan.spacing for scan in self.scans]))
 
     def poses(self, T_mount_scanner: Array) -> Array:
-        """Return T_reference_scanner (V, 4, 4) under a hand-eye."""
+        """Return T_reference_scanner (V, 4, 4) under a hand-eye T_mount_scanner (4, 4)."""
         poses = self.hand_eye_frames(T_mount_scanner)
         return poses if self.T_behind_mount is None else poses @ self.T_behind_mount
 
     def hand_eye_frames(self, T_mount_scanner: Array) -> Array:
-        """Return (V, 4, 4) whose adjoint carries a right perturbation of the hand-eye into the reference frame."""
+        """Return T_reference_mount · T_mount_scanner (V, 4, 4), without what stands right of the hand-eye.
+
+        Its adjoint maps a right perturbation of the hand-eye, T·exp(ξ), to a twist in the reference frame.
+        """
         return self.T_reference_mount @ T_mount_scanner
 
     def without_stock(self, stock: Mapping[int, Stock | None]) -> "Capture":
-        """Return the capture with stock taken off the scans of some views; None: given back, and not asked of again."""
+        """Return the capture with the points of stock moved back to the surface under it.
+
+        Args:
+            stock: view -> stock to take off; None: points that were moved before return to where they were scanned,
+                and no view of the capture is searched for stock again (`none_has_stock`).
+        """
         scans = tuple(without_stock(s, stock[v]) if v in stock else s for v, s in enumerate(self.scans))
         return replace(self, scans=scans, none_has_stock=self.none_has_stock or None in stock.values())
 
     def without(self, left_out: Indices) -> "Capture":
-        """Return the capture less some views."""
+        """Return the capture without the views at the indices `left_out`; stops are numbered anew from 0."""
         keep = np.setdiff1d(np.arange(len(self.T_reference_mount)), left_out)
         of_views = ("scans", "T_reference_mount", "T_reference_flange", "T_behind_mount", "scanner")
         return replace(
@@ -171,7 +186,9 @@ class Capture:
 
 
 def prepare_capture(session: SessionData) -> Capture:
-    """Prepare the scans and labelled points of a session and place them on the chain of frames.
+    """Return the capture of a session: its scans made ready for matching, its labelled points, its chain of frames.
+
+    Of labelled points without scans so many are used that the fit stays within memory (`_MOST_PRODUCTS`).
 
     Raises:
         InputError: every cloud is one profile.
@@ -191,7 +208,10 @@ def prepare_capture(session: SessionData) -> Capture:
 
 
 def of_scanners(session: SessionData, capture: Capture) -> Capture:
-    """Return the capture of a joined session with its scanners where they stand to begin with; another as it is."""
+    """Return the capture with the scanner and stop of each view, if the session joins several scanners; else as it is.
+
+    `T_behind_mount` places each further scanner as its own session states it.
+    """
     scanners = scanners_of(session)
     if not scanners:
         return capture
@@ -201,7 +221,13 @@ def of_scanners(session: SessionData, capture: Capture) -> Capture:
 def build_capture(
     name: str, scans: Sequence[Scan], T_base_flange: Array, mount: str, sightings: Sightings | None = None
 ) -> Capture:
-    """Return a capture from scans, labelled points and flange poses (V, 4, 4)."""
+    """Return a capture from scans, labelled points and flange poses.
+
+    Args:
+        T_base_flange: (V, 4, 4).
+        mount: eye_to_hand | eye_in_hand: which of flange and base is the reference frame.
+        sightings: labelled points; None: there are none.
+    """
     if mount == "eye_in_hand":
         return Capture(name, tuple(scans), T_base_flange, T_base_flange, sightings=sightings)
     still = np.broadcast_to(np.eye(4), T_base_flange.shape)
@@ -209,10 +235,10 @@ def build_capture(
 
 
 def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
-    """Return the scans of all views.
+    """Return the scans of all views that have a cloud, made ready for matching on all cores.
 
-    Where room is no matter, all neighbours first: a library finds them without Python, for which the rest waits again
-    and again while another thread still loads modules.
+    Where memory allows, the neighbours of all points are found first. The library does that without the interpreter's
+    lock, which other threads that still import modules hold again and again.
     """
     seen = [(scanner_of(session, view), view.cloud) for view in session.views if view.cloud is not None]
     clouds = [cloud for _, cloud in seen]
@@ -222,6 +248,7 @@ def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
         around = list(parallel(lambda points: None if points is None else find_neighbourhoods(points), whole))
 
     def prepared(item: tuple[str, tuple[Scanner, Cloud], Neighbourhoods | None]) -> Scan:
+        """Return the scan of one view; of a thinned cloud the one that was made from all points."""
         name, (scanner, cloud), neighbours = item
         if cloud.whole is not None:
             return cloud.whole.scan
@@ -231,7 +258,11 @@ def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
 
 
 def sightings_of(session: SessionData) -> Sightings | None:
-    """Return all labelled points of a session, its views in order; None without any."""
+    """Return all labelled points of a session as arrays over views and slots; None without any.
+
+    Targets are numbered in the order of their names. A missing sigma is the scanner's noise, else `_USUAL_SIGMA_M`; a
+    missing one of a probe's rotation is the sigma of its position over `_PROBE_LEVER_M`.
+    """
     seen = {v: view.sighting for v, view in enumerate(session.views) if view.sighting is not None}
     names = sorted({name for sighting in seen.values() for name in sighting.targets})
     if not names:

@@ -60,8 +60,8 @@ class Views:
     covariates: dict[str, Array]  # (V,) each, without gaps
     standoff: float
     first: dict[str, float]  # the covariates at the session's first view
-    number: Indices  # (V,) of the view in its session, from 0
-    path: Array  # (W, n) joints of all views of the session, by their number
+    number: Indices  # (V,) index of each view in its whole session, of W views, where these are some of them
+    path: Array  # (W, n) joints of all views of the session
     T_base_flange: Array  # (V, 4, 4) reported
     gravity: Array  # (3,) unit vector, base frame; (V, 3) where an axis turns what is left of the robot; zero: unknown
     eye_to_hand: bool
@@ -73,7 +73,7 @@ class Views:
 
     @cached_property
     def by_scanner(self) -> tuple["Views", ...]:
-        """Return all views as the effects of each scanner know them: its hand-eye, standoff and first view."""
+        """All V views once for each scanner, with its hand-eye, standoff and first covariates; () for one scanner."""
         every = zip(self.scanners.T_first, self.scanners.standoff, self.own_first, strict=True)
         return tuple(
             replace(self, T_mount=self.T_mount @ T, standoff=standoff or self.standoff, first=first)
@@ -82,12 +82,12 @@ class Views:
 
     @cached_property
     def gravity_at_mount(self) -> Array:
-        """Return (V, 3) unit vectors in the mount frame: the flange where it carries the scanner, else the base."""
+        """Gravity as unit vectors (V, 3) in the mount frame: the flange where it carries the scanner, else the base."""
         return self._gravity_in_base if self.eye_to_hand else self._gravity_in_flange
 
     @cached_property
     def gravity_at_part(self) -> Array:
-        """Return (V, 3) unit vectors in the reference frame: the flange where it carries the part, else the base."""
+        """Gravity as unit vectors (V, 3) in the reference frame: the flange if it carries the part, else the base."""
         return self._gravity_in_flange if self.eye_to_hand else self._gravity_in_base
 
     @property
@@ -100,34 +100,51 @@ class Views:
         return np.tile(self.gravity, (self.count, 1)) if self.gravity.ndim == 1 else self.gravity
 
     def at_scanner(self, twists: Array) -> Array:
-        """Return (V, 6) twists of the mount frame about its origin, as an effect of the mount returns them."""
+        """Return twists (V, 6) of the mount frame, about its origin, as twists in the scanner frame: Ad(T_mount⁻¹) ξ.
+
+        Effects of the mount return the latter.
+        """
         return twists @ frames.adjoint(frames.inverse(self.T_mount)).T
 
     def sag(self, c: Array) -> Array:
-        """Return (V, n) joint angles of the compliances c (m,) under the gravity torques."""
+        """Return the deflections (V, n) of the joints, rad, under the m gravity torques.
+
+        Args:
+            c: (m,) compliances, rad/(N m), of the joint that each torque bends.
+        """
         sag = np.zeros_like(self.joints)
         for k, joint in enumerate(self.torques.joint):
             sag[:, joint] += c[k] * self.torques.values[:, k]
         return sag
 
     def tilt(self, c: Array) -> Array:
-        """Return (V, 6) twists of the base that yields by c (k,) under the moments of arm and load."""
+        """Return twists (V, 6) of the base under the k moments of arm and load: rotations about its x and y.
+
+        Args:
+            c: (k,) compliances, rad/(N m).
+        """
         twists = np.zeros((self.count, 6))
         for k, axis in enumerate(self.torques.base_axis):
             twists[:, axis] += c[k] * self.torques.base[:, k]
         return twists
 
     def since_first(self, covariate: str) -> Array:
-        """Return (V,) a covariate less its value at the first view."""
+        """Return a covariate (V,) less its value at the session's first view."""
         return self.covariates[covariate] - self.first[covariate]
 
     def behind(self, joint: int, play: float) -> Array:
-        """Return (V,) rad by which what a joint drives stays behind it where friction holds it within ± `play`.
+        """Return by how much the driven side of a joint lags behind its angle, (V,) rad, with friction and play.
 
-        It follows the last reversals and not only the last direction: the play operator (Krejčí 1996, "Hysteresis,
-        Convexity and Dissipation in Hyperbolic Equations", ch. II), at rest in the first view of the session.
+        The driven side rests until the joint is `play` away, then follows at that distance: the play operator (Krejčí
+        1996, "Hysteresis, Convexity and Dissipation in Hyperbolic Equations", ch. II). So it depends on all reversals,
+        not only on the last direction. It has no lag in the first view of the session.
+
+        Args:
+            joint: counted from 0.
+            play: half width of the dead band, rad.
         """
-        states = np.append(np.nan, self.path[:, joint])  # before the first view, and after each
+        # The driven side's angle before the first view, and after each view of the whole session.
+        states = np.append(np.nan, self.path[:, joint])
         for v, at in enumerate(self.path[1:, joint], start=2):
             states[v] = min(max(states[v - 1], at - play), at + play)
         q = self.joints[:, joint]
@@ -141,12 +158,16 @@ class Views:
 
     @property
     def temperatures(self) -> tuple[int, ...]:
-        """Return the numbers of those of `TEMPERATURES` that were measured and change."""
+        """The indices into `TEMPERATURES` of those that were measured in every view and change."""
         measured = [i for i, name in enumerate(TEMPERATURES) if name in self.covariates]
         return tuple(i for i in measured if np.ptp(self.covariates[TEMPERATURES[i]]) > 0)
 
     def only(self, keep: Sequence[int]) -> "Views":
-        """Return some of the views; their numbers, rows before them and first values stay those of the session."""
+        """Return the views at the indices `keep`.
+
+        `number`, `previous`, `path` and `first` still refer to the whole session: history does not change with a
+        selection.
+        """
         return replace(
             take_rows(self, keep, *_OF_VIEWS, *(["gravity"] if self.gravity.ndim > 1 else [])),
             count=len(keep),
@@ -156,7 +177,11 @@ class Views:
         )
 
     def has(self, need: str) -> bool:
-        """Return True if joints, time, torque, velocity or a covariate is known for every view, or if gravity turns."""
+        """Return True if the views know an input that an effect needs: it is given in every view and, partly, changes.
+
+        Args:
+            need: a key of `known` below, or the name of a covariate.
+        """
         known = {
             "joints": self.joints.shape[1] > 0,
             "torque": len(self.torques.names) > 0,
@@ -176,18 +201,18 @@ class Views:
 
 @dataclass(frozen=True)
 class ScanView:
-    """One view for the functions of points: N of them in the scanner frame, or the reference frame for `shape`."""
+    """One view as effects of points know it: N points in the scanner frame, or in the reference frame for `shape`."""
 
-    index: int
+    index: int  # of the view among `views`
     views: Views
     cosine: Array  # (N,) of incidence, 0 … 1
     intensity: Array | None  # (N,) standardised over the session
-    size: float  # of the part: lengths of shape effects may be counted in it
+    size: float  # of the part, length_unit: lengths of shape effects may be counted in it
     origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
-    eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, its own frame
+    eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, scanner frame
 
     def along(self, points: Array) -> Array:
-        """Return (N, 3) unit rays from the scanner's eye to points."""
+        """Return unit vectors (N, 3) from the scanner's eye to points (N, 3), scanner frame."""
         away = self.away(points)
         return away / np.sqrt(np.einsum("ij,ij->i", away, away))[:, None]
 
@@ -241,8 +266,10 @@ class Measurement:
 
     @cached_property
     def has_optics(self) -> bool:
-        """True unless the sensor has no lens: a tracker, or the probe that it follows; if it is not stated, one that
-        shows points where no lens looks, beside it or behind."""
+        """True unless the sensor has no lens: a tracker, or the probe that it follows.
+
+        Of a sensor that is not stated: True unless it shows points beside or behind itself, where no lens looks.
+        """
         if self.sensor is not None:
             return self.sensor not in ("tracker", "probe")
         return all_ahead(self.capture.point_sets)
@@ -253,11 +280,15 @@ class Measurement:
         return self.sensor in (None, "area", "line")
 
     def without(self, left_out: Sequence[int]) -> "Measurement":
-        """Return the measurement less some views; numbers, rows before and first values of the others stay."""
+        """Return the measurement without the views at the indices `left_out`.
+
+        What the others know of the session's history stays (`Views.only`).
+        """
         keep = [v for v in range(self.views.count) if v not in set(left_out)]
         views = self.views.only(keep)
 
-        def kept(of: tuple[ScanView, ...]) -> tuple[ScanView, ...]:
+        def remaining(of: tuple[ScanView, ...]) -> tuple[ScanView, ...]:
+            """Return the views that stay, numbered anew; () where there were none."""
             return tuple(replace(of[v], index=i, views=views) for i, v in enumerate(keep)) if of else ()
 
         return replace(
@@ -265,8 +296,8 @@ class Measurement:
             capture=self.capture.without(np.array(sorted(left_out), np.int64)),
             T_base_flange=self.T_base_flange[keep],
             views=views,
-            scan_views=kept(self.scan_views),
-            target_views=kept(self.target_views),
+            scan_views=remaining(self.scan_views),
+            target_views=remaining(self.target_views),
         )
 
     def __repr__(self) -> str:
@@ -274,7 +305,11 @@ class Measurement:
 
 
 def measurement_of(session: SessionData, capture: Capture) -> Measurement:
-    """Return what was measured: a session and its prepared scans."""
+    """Return the measurement of a session: its capture, and what effects may know of its views.
+
+    Args:
+        capture: of the same session, from `prepare_capture`.
+    """
     views = views_of(session)
     intensity = _intensities(session)
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
@@ -284,7 +319,7 @@ def measurement_of(session: SessionData, capture: Capture) -> Measurement:
     ]
     target_views: list[ScanView] = []
     if capture.sightings is not None:
-        # Nobody knows at what slant a target was seen, or how bright: effects of these have nothing to say about it.
+        # Slant and brightness of a target are not known: straight on and of mean intensity, effects of them are zero.
         straight = np.ones(capture.sightings.used.shape[1])
         usual = None if intensity[0] is None else np.zeros(len(straight))
         target_views = [ScanView(v, views, straight, usual, size=size) for v in range(views.count)]
@@ -302,7 +337,7 @@ def measurement_of(session: SessionData, capture: Capture) -> Measurement:
 
 
 def _intensities(session: SessionData) -> list[Array | None]:
-    """Return the intensities of each view, standardised over the session: (I − Ī)/σ_I; None without."""
+    """Return per view intensities (N,) standardised over the session, (I − Ī)/σ_I; None where they do not count."""
     scale = intensity_scale(session)
     if scale is None:
         return [None] * len(session.views)
@@ -313,7 +348,7 @@ def _intensities(session: SessionData) -> list[Array | None]:
 def intensity_scale(session: SessionData) -> tuple[float, float] | None:
     """Return mean and standard deviation of the intensity over all points in memory.
 
-    None where some points have none, or all the same.
+    None where a view has no intensity, one value is not finite, or all are the same.
     """
     scalars = [view.cloud.scalars for view in session.views if view.cloud is not None]
     by_view = [of_cloud["intensity"] for of_cloud in scalars if "intensity" in of_cloud]
@@ -327,10 +362,12 @@ def intensity_scale(session: SessionData) -> tuple[float, float] | None:
 
 
 def require_rising_times(session: SessionData) -> None:
-    """Refuse views whose times fall: a folder's are when it is read, a program may have changed those of a session.
+    """Refuse a session whose views are not in the order of time; views without a time are passed over.
+
+    Folders are checked as they are read; sessions made in a program are checked here.
 
     Raises:
-        InputError: times fall from view to view.
+        InputError: the time of a view is before that of one listed earlier.
     """
     time = np.array([np.nan if view.time_s is None else view.time_s for view in session.views])
     if (falls := np.flatnonzero(time < np.fmax.accumulate(time))).size:
@@ -339,7 +376,11 @@ def require_rising_times(session: SessionData) -> None:
 
 
 def views_of(session: SessionData) -> Views:
-    """Collect what effects may know; joints count only where the robot's kinematics are known too."""
+    """Return what effects may know of the V views of a session.
+
+    Joints count only where every view has them and the robot's kinematics are known; a covariate only if every view has
+    it. Velocities and torques of drives, which are columns too, are taken out of the covariates.
+    """
     views = session.views
     axes = axes_of(session)
     scanners = scanners_of(session)
@@ -388,7 +429,10 @@ def views_of(session: SessionData) -> Views:
 
 
 def _gravity_left_of(axes: Axes, session: SessionData) -> Array:
-    """Return gravity in the frame left of the effective poses: (3,), or (V, 3) where an axis turns it."""
+    """Return gravity as unit vectors in the frame that the effective poses map to: (3,), or (V, 3) if an axis turns it.
+
+    That is the base, or the part that axes carry: A_left⁻¹ · gravity. Zero without a robot, where it is not known.
+    """
     if not session.has_poses:
         return np.zeros(3)
     gravity = gravity_of(session.robot)
@@ -397,13 +441,14 @@ def _gravity_left_of(axes: Axes, session: SessionData) -> Array:
 
 
 def gravity_of(robot: Robot | None) -> Array:
-    """Return (3,) unit vector, base frame: as the robot's table states it, else downwards."""
+    """Return gravity as a unit vector (3,) in the base frame: as [robot] states it, else along −z."""
     if robot is None or not np.linalg.norm(robot.gravity) > 0:
         return np.array([0.0, 0.0, -1.0])
     return robot.gravity / np.linalg.norm(robot.gravity)
 
 
 def _median_range(session: SessionData) -> float:
+    """Return the median over views of the median distance of points from the sensor, length_unit; 1 without points."""
     points = [view.cloud.points for view in session.views if view.cloud]
     points += [view.sighting.points for view in session.views if view.sighting]
     ranges = [np.median(np.linalg.norm(of_view, axis=1)) for of_view in points]
@@ -411,10 +456,13 @@ def _median_range(session: SessionData) -> float:
 
 
 def with_part_origin(measurement: Measurement, T_mount: Array) -> Measurement:
-    """Return the measurement with the origin about which a part grows, and the place of the scanner on its mount.
+    """Return the measurement with what effects need of the hand-eye: itself, and the origin about which a part grows.
 
-    A coarse hand-eye is enough. On the flange that origin is the flange, which holds the part; in the cell it is the
-    middle of what the views show.
+    The origin is that of the reference frame where the flange carries the part, since it is held there; else the mean
+    of what the views show.
+
+    Args:
+        T_mount: (4, 4) hand-eye; a coarse one is enough.
     """
     views = replace(measurement.views, T_mount=T_mount)
     origin = np.zeros(3)
@@ -430,9 +478,10 @@ def with_part_origin(measurement: Measurement, T_mount: Array) -> Measurement:
 
 
 def sensor_kind(session: SessionData) -> SensorKind | None:
-    """Return the kind as stated, or a tracker where its points are given in the robot's base; None if unknown.
+    """Return the kind of sensor as stated; else "tracker" where its points are given in the robot's base; else None.
 
-    No scanner stands inside the robot. Points on the flange stand still in its frame if the sensor's frame is the base.
+    If the sensor's frame is the base, points mapped to the flange by the robot's pose stand still there. No scanner has
+    its origin in the robot's base, so such points come from a tracker.
     """
     if session.scanner.kind is not None or session.mount != "eye_to_hand":
         return session.scanner.kind
@@ -455,7 +504,11 @@ def _variance_within(points: Array, group: Indices) -> float:
 
 
 def all_ahead(point_sets: Sequence[Array]) -> bool:
-    """Return True if a lens may have seen all points, sensor frame: none beside it or behind."""
+    """Return True if one lens along ±z can have seen the points: 98 % within 75° of that axis.
+
+    Args:
+        point_sets: arrays (N, 3), sensor frame.
+    """
     some = [points[:: 1 + len(points) // _ENOUGH] for points in point_sets]
     if not some:
         return True

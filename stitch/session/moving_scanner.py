@@ -15,13 +15,13 @@ _FEWEST = 4
 
 
 def stand_still(session: SessionData) -> SessionData:
-    """Return the session with every point moved to where it would lie had the scanner stood at the pose of its view.
+    """Return the session with each point in the frame of the scanner at the time of its view, not at its own time.
 
-    The robot's path runs smoothly through the poses of the views. The hand-eye that carries it over to the scanner
-    is that of the scans' own odometry where they are a stream, else the stated one.
+    The robot's path is a spline through the poses of the views. The hand-eye that turns it into the scanner's path is
+    found from the odometry of the scans, if the scanner never stopped; else it is the stated one.
 
     Raises:
-        InputError: a view without time, or a cloud whose points have none; or no hand-eye at all.
+        InputError: a view or a point without time, times that do not rise, too few views, or no hand-eye.
     """
     where = session.path / "session.toml"
     times = [view.time_s for view in session.views]
@@ -53,13 +53,17 @@ def stand_still(session: SessionData) -> SessionData:
 
 
 def _mount_poses(session: SessionData) -> Array:
-    """Return T_reference_mount (V, 4, 4): the flange in the base frame, or for a scanner that stands the inverse."""
+    """Return T_reference_mount (V, 4, 4): T_base_flange where the flange carries the scanner, else its inverse."""
     T = np.array([view.T_base_flange for view in session.views])
     return T if session.mount == "eye_in_hand" else frames.inverse(T)
 
 
 def _stream_hand_eye(session: SessionData) -> Array | None:
-    """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream; None where the scans are none."""
+    """Return T_mount (4, 4) found from the odometry of a scanner that never stopped, by A·X = X·B.
+
+    The search begins with the stated hand-eye, then without one. None: the scanner stopped between scans, or its
+    odometry does not turn as the robot does.
+    """
     clouds = [view.cloud for view in session.views if view.cloud is not None]
     scans = [cloud.points for cloud in clouds]
     T_reference_mount = _mount_poses(session)
@@ -77,10 +81,10 @@ def _stream_hand_eye(session: SessionData) -> Array | None:
 
 
 class _RobotPath:
-    """T_reference_mount between the views: splines through their poses."""
+    """T_reference_mount as a function of time: splines through the poses of the views."""
 
     def __init__(self, times: Array, T_reference_mount: Array) -> None:
-        """Join poses (V, 4, 4) at times (V,), s, by a smooth path: cubic splines of positions and of rotations."""
+        """Fit cubic splines of positions and of rotations to T_reference_mount (V, 4, 4) at rising times (V,), s."""
         self.times = times
         # Few sessions have a scanner that moves: the others do not wait for it.
         from scipy.interpolate import CubicSpline
@@ -91,7 +95,8 @@ class _RobotPath:
         self._turn = RotationSpline(times, Rotation.from_matrix(T_reference_mount[:, :3, :3]))
 
     def at(self, times: Array) -> Array:
-        """Return (K, 4, 4) at times (K,), which may lie a little before the first view or after the last."""
+        """Return T_reference_mount (K, 4, 4) at times (K,), s; before the first view and after the last at constant
+        velocity."""
         within = np.clip(times, self.times[0], self.times[-1])
         T = np.tile(np.eye(4), (len(times), 1, 1))
         rate = self._turn(within, 1)
@@ -102,7 +107,13 @@ class _RobotPath:
 
 
 def _seen_from_view(points: Array, times: Array, path: _RobotPath, of_view: float, T_mount: Array) -> Array:
-    """Return points (N, 3), each seen at its time, in the scanner's frame at the time of the view."""
+    """Return points (N, 3) mapped from the scanner's frame at their own time to its frame at the time of the view.
+
+    Args:
+        times: (N,) s after the time of the view.
+        of_view: s, time of the view on the path.
+        T_mount: (4, 4) hand-eye.
+    """
     moments, index = np.unique(times, return_inverse=True)
     T_reference_scanner = path.at(of_view + moments) @ T_mount
     T = (frames.inverse(path.at(np.array([of_view]))[0] @ T_mount) @ T_reference_scanner)[index]

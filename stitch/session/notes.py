@@ -8,12 +8,16 @@ from stitch.session.torques import PAYLOAD
 
 
 def session_notes(session: SessionData) -> list[str]:
-    """Return a sentence each; `check` and `run` say the same."""
+    """Return sentences on what is assumed of a session before anything is fitted; `check` and `run` print them."""
     return [note for note in (payload_note(session), gaps_note(session), sensor_note(session)) if note]
 
 
 def payload_note(session: SessionData) -> str:
-    """Return where a payload counts whose centre of mass nobody states; empty if one is stated, or none is carried."""
+    """Return a sentence that a payload of unknown centre of mass counts at the flange's origin; "" if none does.
+
+    None does where the centre is stated, nothing is carried, or gravity's torques are not needed: joints are missing,
+    or drives report the torques.
+    """
     robot = session.robot
     if robot is None or not robot.carries_at_flange or any(view.joints is None for view in session.views):
         return ""
@@ -30,9 +34,9 @@ def payload_note(session: SessionData) -> str:
 
 
 def gaps_note(session: SessionData) -> str:
-    """Return which columns of views.csv do not count, since in some views nothing stands there; empty without gaps.
+    """Return a sentence that lists columns of views.csv that are not used, since some views lack them; "" if none.
 
-    A view that lacks each is named.
+    For each column the first view that lacks it is named.
     """
     without = defaultdict[str, list[str]](list)
     columns = sorted({name for view in session.views for name in view.covariates})
@@ -42,7 +46,7 @@ def gaps_note(session: SessionData) -> str:
         gaps += ["joint angles"] if view.joints is None else []
         for column in gaps:
             without[column].append(view.name)
-    # What no view has is no gap.
+    # A column that all views lack was not measured: no gap.
     notes = [
         f"{column} ({views[0]}{f' and {len(views) - 1} more' if len(views) > 1 else ''} without)"
         for column, views in without.items()
@@ -52,7 +56,10 @@ def gaps_note(session: SessionData) -> str:
 
 
 def sensor_note(session: SessionData) -> str:
-    """Return what the sensor of labelled points is taken for, where session.toml does not state it; else nothing."""
+    """Return a sentence on the kind that the sensor of labelled points is taken for; "" where it is stated.
+
+    Also "" for scans, and without labelled points.
+    """
     points = [view.sighting.points for view in session.views if view.sighting is not None]
     if session.scanner.kind is not None or session.has_clouds or not points:
         return ""

@@ -9,6 +9,7 @@ Of an arm whose links are a little wrong (`Links`): where its flange truly is, a
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,7 +67,13 @@ class Robot:
 
 
 def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
-    """Return rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
+    """Return transforms (..., 4, 4) that turn about and shift along one coordinate axis.
+
+    Args:
+        axis: x | y | z.
+        angle: (...) rad.
+        shift: (...) length_unit.
+    """
     angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -101,9 +108,10 @@ def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
 
 
 def jacobian(robot: Robot, joints: Array) -> Array:
-    """Return (..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
+    """Return J (..., 6, n) with T_base_flange(q + dq) ≈ T_base_flange(q)·exp(J dq), for joint angles (..., n) rad.
 
-    The columns are the joint screws seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    Twists in the flange frame, rotation first: rad and length_unit per rad. The columns are the joints' screws in that
+    frame (Lynch & Park, *Modern Robotics*, 5.1.2).
     """
     point, axis = joint_axes(robot, joints)
     T = forward(robot, joints)
@@ -114,7 +122,10 @@ def jacobian(robot: Robot, joints: Array) -> Array:
 
 
 def unit_torques(robot: Robot, joints: Array) -> Array:
-    """Return (..., n, n) N·m about joint i of 1 kg at the origin of link k's frame; 0 where i does not carry it."""
+    """Return torques of gravity (..., n, n), N·m, about joint i of 1 kg at the origin of link k's frame; 0 for k < i.
+
+    z_i · (p_k − o_i) × g, at joint angles (..., n) rad, about +z of the joint.
+    """
     link = link_frames(robot, joints)
     point, axis = joint_axes(robot, joints)
     lever = link[..., None, 1:, :3, 3] - point[..., :, None, :]
@@ -129,8 +140,10 @@ def base_moments(robot: Robot, joints: Array) -> Array:
 
 
 def mass_centres(robot: Robot, joints: Array) -> Array:
-    """Return (..., n+1, 3) centres of mass in the base frame: of each link, or its frame's origin where none is known,
-    and of the payload."""
+    """Return centres of mass (..., n+1, 3), base frame: of each link, then of the payload, at joints (..., n) rad.
+
+    Where the robot states none it is the origin of the link's frame, or of the flange.
+    """
     link = link_frames(robot, joints)
     centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
     tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
@@ -146,9 +159,13 @@ def payload_torques(robot: Robot, joints: Array) -> Array:
 
 
 def gravity_torques(robot: Robot, joints: Array) -> Array:
-    """Return torques of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
+    """Return torques of gravity about +z of every joint (..., n), N·m: z_i · Σ (c − o_i) × m g over what it carries.
 
-    Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
+    Minus the gradient of the potential energy V = −Σ m g·c; a drive holds the opposite. Links and payload count; zeros
+    without masses.
+
+    Args:
+        joints: (..., n) rad.
     """
     point, axis = joint_axes(robot, joints)
     centres = mass_centres(robot, joints)
@@ -163,13 +180,13 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
 
 @dataclass(frozen=True)
 class Links:
-    """What is wrong with an arm's links: factors on all lengths and on those of each link, and errors of the DH rows.
+    """Errors of an arm's links in V views: factors on lengths, and additions to the Denavit–Hartenberg parameters.
 
-    For URDF the errors act behind the joint in the frame that its axis makes: along x, along z, about x.
+    Of a URDF arm the additions act after the joint, in the frame whose z is its axis: along x, along z, about x.
     """
 
-    scale: Array  # (V,)
-    lengths: Array  # (V, n)
+    scale: Array  # (V,) factor on all lengths
+    lengths: Array  # (V, n) factor on the lengths of each link
     da: Array  # (n,) length_unit
     dd: Array  # (n,) length_unit
     dalpha: Array  # (n,) rad
@@ -177,7 +194,7 @@ class Links:
 
 @dataclass(frozen=True)
 class FlangeSlopes:
-    """Body twists of the flange, T·exp(slope·error), rotation first, per unit of each error."""
+    """Derivatives of the flange's pose: twists in its frame, T·exp(slope·error), rotation first, per unit of error."""
 
     joints: Array  # (V, 6, n)
     scale: Array  # (V, 6)
@@ -187,7 +204,11 @@ class FlangeSlopes:
     dalpha: Array  # (V, 6, n)
 
     def twists(self, joints: Array, links: Links) -> Array:
-        """Return (V, 6) twists of the flange for small changes of the joint angles (V, n) and of the links."""
+        """Return twists (V, 6) of the flange, in its frame, for small changes of joint angles (V, n) rad and links.
+
+        Args:
+            links: changes of all factors and additions; a `scale` of 0 means no change.
+        """
         rows = np.einsum("vki,i->vk", self.da, links.da) + np.einsum("vki,i->vk", self.dd, links.dd)
         rows += np.einsum("vki,i->vk", self.dalpha, links.dalpha)
         rows += np.einsum("vki,vi->vk", self.lengths, links.lengths)
@@ -201,21 +222,23 @@ def exact_links(count: int, joints: int) -> Links:
 
 def forward_with_errors(robot: Robot, joints: Array, links: Links) -> Array:
     """Return T_base_flange (V, 4, 4) of an arm with such links, for joint angles (V, n) in rad."""
-    return _chain(robot, joints, links)[-1][2]
+    return _chain(robot, joints, links)[-1].end
 
 
 def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
-    """Return how the flange answers to small changes of joint angles (V, n) and links, about these.
+    """Return the derivatives of the flange's pose by joint angles and link errors, at joints (V, n) rad and `links`.
 
-    Each error is a screw in a frame of the chain, seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    Each error is a screw in a frame of the chain, expressed in the flange frame (Lynch & Park, *Modern Robotics*,
+    5.1.2).
     """
     chain = _chain(robot, joints, links)
-    T = chain[-1][2]
+    T = chain[-1].end
     modified = robot.convention == "modified"
     still = np.zeros((len(joints), 3))
     scale = np.zeros((len(joints), 6))
     slopes = dict[str, list[Array]](joints=[], lengths=[], da=[], dd=[], dalpha=[])
     for (before, turned, after, moved), factor in zip(chain, links.lengths.T, strict=True):
+        # Additions to a and d are lengths of the link: the factors multiply them too.
         reach = (links.scale * factor)[:, None]
         row = before if modified else after  # the frame at whose x axis da and dalpha act
         slopes["joints"].append(_screw(T, turned, turned[..., :3, _Z], still))
@@ -229,9 +252,20 @@ def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
     return FlangeSlopes(scale=scale, **{name: np.stack(by_joint, axis=-1) for name, by_joint in slopes.items()})
 
 
-def _chain(robot: Robot, joints: Array, links: Links) -> list[tuple[Array, Array, Array, Array]]:
-    """Return per joint the frames T_base_· (V, 4, 4) before its turn, after it and at the link's end, and (V, 3) by how
-    much the link's lengths move that end."""
+class _Link(NamedTuple):
+    """One link of a chain in V views, base frame."""
+
+    before: Array  # (V, 4, 4) T_base_joint, before the joint's rotation
+    turned: Array  # (V, 4, 4) the same after the rotation
+    end: Array  # (V, 4, 4) T_base_link, where the next joint begins
+    reach: Array  # (V, 3) part of the way from the last link's end to this one's that its lengths make
+
+
+def _chain(robot: Robot, joints: Array, links: Links) -> list[_Link]:
+    """Return the n links of an arm with errors, at joint angles (V, n) rad.
+
+    T_base_end = T_last_end · before · Rz(q + theta) · after, with the errors where the convention has its parameters.
+    """
     x_error = elementary("x", links.dalpha, links.da)
     z_error = elementary("z", 0, links.dd)
     T = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
@@ -245,20 +279,26 @@ def _chain(robot: Robot, joints: Array, links: Links) -> list[tuple[Array, Array
         turned = first @ elementary("z", joints[:, i] + robot.theta[i])
         last = turned @ _scaled(after, scale)
         moved = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
-        chain.append((first, turned, last, moved))
+        chain.append(_Link(first, turned, last, moved))
         T = last
     return chain
 
 
 def _scaled(T: Array, scale: Array) -> Array:
-    """Return (V, 4, 4) of one transform, its lengths times `scale` (V,)."""
+    """Return a transform T (4, 4) V times, its translation multiplied by `scale` (V,): (V, 4, 4)."""
     out = np.tile(T, (len(scale), 1, 1))
     out[:, :3, 3] *= scale[:, None]
     return out
 
 
 def _screw(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
-    """Return (V, 6) body twist of the flange of a turn and a shift (V, 3) in the base's directions, about `at`."""
+    """Return twists (V, 6) of the flange, in its frame, by a rotation and a shift at another frame of the chain.
+
+    Args:
+        T_base_flange: (V, 4, 4).
+        at: (V, 4, 4) T_base_frame; its origin is what the rotation is about.
+        turn, shift: (V, 3) rad and length_unit, base frame.
+    """
     lever = T_base_flange[:, :3, 3] - at[:, :3, 3]
     back = frames.inverse(T_base_flange)
     moved = (turn, np.cross(turn, lever) + shift)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -53,8 +53,8 @@ class Scan:
     points: Array  # (N, 3)
     normals: Array  # (N, 3) unit, towards the scanner
     usable: Array  # (N,) bool: neither edge nor crease nor grazing
-    area: Array  # (N,) surface per point: the inverse of the local density
-    confidence: Array  # (N,) cosine of incidence
+    area: Array  # (N,) length_unit², surface per point: the inverse of the local density
+    confidence: Array  # (N,) cosine of incidence, 0 … 1
     tree: Any = field(repr=False, compare=False)  # pykdtree KDTree over `points`
     spacing: float  # median distance between neighbours
     scanned_spacing: float  # the same between all points that were scanned, of which these may be some
@@ -67,6 +67,7 @@ class Scan:
         return {name: value for name, value in vars(self).items() if name != "tree"}
 
     def __getattr__(self, name: str) -> Any:
+        """Return the tree, built from the points, of a scan that was copied without it: Python asks for it here."""
         if name != "tree" or "points" not in vars(self):
             raise AttributeError(name)
         tree = vars(self)["tree"] = KDTree(self.points, leafsize=16)
@@ -84,7 +85,7 @@ class Scan:
 
     @cached_property
     def solid_angle(self) -> float:
-        """Median solid angle, seen from the eye, that a point on a smooth surface has for itself."""
+        """Median over smooth points of the solid angle per point, sr, seen from the eye: area · cosine / distance²."""
         smooth = self.usable if self.usable.any() else np.ones_like(self.usable)
         away = self.points[smooth] - self.eye
         each = (self.area * self.confidence)[smooth] / np.einsum("ij,ij->i", away, away)
@@ -97,7 +98,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Neighbourhoods:
-    """The points that are nearest to each of n points, itself the first."""
+    """The k nearest points of each of n points, the point itself first."""
 
     tree: Any  # pykdtree KDTree over all points
     index: Indices  # (n, k)
@@ -106,7 +107,11 @@ class Neighbourhoods:
 
 
 def without_stock(scan: Scan, stock: Stock | None) -> Scan:
-    """Return the scan with stock taken off: points on it moved back along their normals; None: with what was taken."""
+    """Return the scan with points of stock moved against their normals, by its thickness, onto the surface below.
+
+    Args:
+        stock: what to take off; None: points that an earlier call moved return to where they were scanned.
+    """
     taken = stock or scan.stock
     assert taken is not None
     outwards = taken.points[:, None] * (taken.thickness if stock else -taken.thickness)
@@ -121,41 +126,46 @@ def prepare_scan(
     eye: Array | None = None,
     around: Neighbourhoods | None = None,
 ) -> Scan:
-    """Return one scan with KD-tree, normals, edges, spacing and noise.
+    """Return a scan made ready for matching: KD-tree, normals, usable points, spacing and noise.
 
-    A normal is that of the local plane of 16 neighbours, or of a quadric where that bends.
+    A normal is that of the plane through 16 neighbours; where that leaves clearly more than noise, of a quadric. Points
+    at an edge, in a crease or at grazing incidence are not usable.
 
     Args:
-        picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
-        eye: (3,) from where the scanner looks, its own frame; the origin unless stated.
-        around: what `find_neighbourhoods` makes of the points, where that has been asked already.
+        name: of the view.
+        points: (M, 3) all points, scanner frame, length_unit.
+        picked: (N,) indices of the points that the scan keeps; None: all. Normals, edges and noise come from all.
+        eye: (3,) from where the scanner looks, scanner frame; None: the origin.
+        around: `find_neighbourhoods(points, picked)`, where the caller has it already.
     """
     points = np.ascontiguousarray(points, float)
-    own = points if picked is None or len(picked) == len(points) else points[picked]
+    selected = points if picked is None or len(picked) == len(points) else points[picked]
     around = around or find_neighbourhoods(points, picked)
     tree, index, radius = around.tree, around.index, around.radius
-    centroid, normals, variation, left = fit_planes(points, index)
+    centroid, normals, variation, residual = fit_planes(points, index)
     eye = np.zeros(3) if eye is None else eye
-    rays = _rays_to(own, eye)
+    rays = _rays_to(selected, eye)
     usable = (np.abs(np.einsum("ij,ij->i", normals, rays)) > GRAZING_COSINE) & (variation < _CREASE_VARIATION)
-    usable &= np.linalg.norm(centroid - own, axis=1) < _EDGE_OFFSET * radius
+    usable &= np.linalg.norm(centroid - selected, axis=1) < _EDGE_OFFSET * radius
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)
-    noise = _estimate_noise(points, own[smooth], normals[smooth], index[smooth])
-    bent = np.flatnonzero(smooth & (left > _BENT * noise))
-    normals[bent] = _bent_normals(points, own[bent], normals[bent], index[bent])
+    noise = _estimate_noise(points, selected[smooth], normals[smooth], index[smooth])
+    bent = np.flatnonzero(smooth & (residual > _BENT * noise))
+    normals[bent] = _bent_normals(points, selected[bent], normals[bent], index[bent])
+    # Normals point towards the scanner, against the rays.
     cosine = np.einsum("ij,ij->i", normals, rays)
     normals *= -np.sign(cosine)[:, None]
     confidence = np.abs(cosine)
     usable &= confidence > GRAZING_COSINE
     spacing = scanned_spacing = around.spacing
-    if len(own) < len(points):
-        tree = KDTree(own, leafsize=16)
-        spacing = _estimate_spacing(own, tree)
-    area = np.pi * radius**2 / index.shape[1] * (len(points) / len(own))
+    if len(selected) < len(points):
+        tree = KDTree(selected, leafsize=16)
+        spacing = _estimate_spacing(selected, tree)
+    # The disc that holds the neighbours, shared among them; fewer selected points stand for more surface each.
+    area = np.pi * radius**2 / index.shape[1] * (len(points) / len(selected))
     return Scan(
         name=name,
-        points=own,
+        points=selected,
         normals=normals,
         usable=usable,
         area=area,
@@ -169,7 +179,7 @@ def prepare_scan(
 
 
 def find_neighbourhoods(points: Array, picked: Indices | None = None) -> Neighbourhoods:
-    """Return the neighbourhoods of all points of a scan, or of those that are picked."""
+    """Return the nearest neighbours, among all points (M, 3), of the points at the indices `picked`, or of all."""
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points, leafsize=16)
     queried = points if picked is None or len(picked) == len(points) else points[picked]
@@ -200,18 +210,29 @@ def _rays_to(points: Array, eye: Array) -> Array:
 
 
 def _estimate_spacing(points: Array, tree: Any) -> float:
+    """Return the median distance of points (N, 3) to their nearest other point, from the tree over them."""
     distance, _ = tree.query(points, k=2)
     return float(np.median(distance[:, 1]))
 
 
-def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Array]:
-    """Fit planes to neighbourhoods, rows (N, k) of points.
+class LocalPlanes(NamedTuple):
+    """Planes fitted to N neighbourhoods of points."""
 
-    Returns:
-        Centroids (N, 3), unit normals (N, 3), surface variation (N,) and 1-sigma about the plane (N,).
+    centroid: Array  # (N, 3) of the neighbours
+    normals: Array  # (N, 3) unit, of either sign
+    variation: Array  # (N,) smallest eigenvalue of the neighbours' covariance over the sum of all, 0 … 1/3
+    sigma: Array  # (N,) standard deviation of the neighbours about the plane, length_unit
+
+
+def fit_planes(points: Array, index: Indices) -> LocalPlanes:
+    """Return the planes fitted to N neighbourhoods by least squares.
+
+    Args:
+        points: (M, 3).
+        index: (N, k) indices of the points of each neighbourhood.
     """
     centroid, normals = np.empty((len(index), 3)), np.empty((len(index), 3))
-    variation, left = np.empty(len(index)), np.empty(len(index))
+    variation, sigma = np.empty(len(index)), np.empty(len(index))
     columns = np.ascontiguousarray(points.T)
     for start in range(0, len(index), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
@@ -225,14 +246,17 @@ def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Arra
             C[i, j] = C[j, i] = np.einsum("kn,kn->n", around[i], around[j])
         centroid[at] = middle.T
         normals[at], variation[at] = _weakest_directions(C)
-        left[at] = np.sqrt(np.maximum(variation[at], 0) * np.trace(C) / max(len(rows) - 3, 1))
-    return centroid, normals, variation, left
+        # The smallest eigenvalue is the sum of squares about the plane, which takes three degrees of freedom.
+        sigma[at] = np.sqrt(np.maximum(variation[at], 0) * np.trace(C) / max(len(rows) - 3, 1))
+    return LocalPlanes(centroid, normals, variation, sigma)
 
 
 def _weakest_directions(C: Array) -> tuple[Array, Array]:
-    """Return eigenvectors (N, 3) of the smallest eigenvalues of covariances (3, 3, N), and their share (N,) of traces.
+    """Return unit eigenvectors (N, 3) of the smallest eigenvalues of covariances C (3, 3, N), and these over traces.
 
-    The eigenvalues are the roots of a cubic, by its angle (Smith 1961); all rows of C − λ lie across the eigenvector.
+    The eigenvalues are the roots of a cubic in closed form (Smith 1961). All rows of C − λ are orthogonal to the
+    eigenvector: the longest cross product of two of them gives it. Where all are short, as of points along a line, a
+    library's decomposition is used.
     """
     scaled = C / np.maximum(np.trace(C), 1e-300)
     mean, one = np.trace(scaled) / 3, np.eye(3)[:, :, None]
@@ -255,52 +279,72 @@ def _weakest_directions(C: Array) -> tuple[Array, Array]:
     return normals, smallest
 
 
-def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -> float:
-    """Return 1-sigma of the points across a local quadric: median over some of the neighbourhoods of `own`.
+def _estimate_noise(points: Array, centres: Array, normals: Array, index: Indices) -> float:
+    """Return the standard deviation of points from local quadrics, length_unit: median over up to 1500 neighbourhoods.
 
-    A plane would count curvature as noise. White noise only: an error that is smooth over the
-    neighbourhood moves the quadric with it and is not seen.
+    Only white noise: an error that is smooth over the neighbourhood moves the quadric with it and is not seen. A plane
+    would count curvature as noise. NaN where neighbourhoods have too few points for a quadric.
+
+    Args:
+        points: (M, 3) all points.
+        centres: (N, 3) points whose neighbourhoods are used.
+        normals: (N, 3) unit normals at the centres.
+        index: (N, k) indices of each centre's neighbours among all points.
     """
     count = index.shape[1]
     if count <= 8:
         return float("nan")
-    centre = even_indices(len(own), _NOISE_SAMPLES)
-    rest, _, numbers = _fit_quadrics(points, own[centre], normals[centre], index[centre])
-    degrees = count - numbers()
+    sample = even_indices(len(centres), _NOISE_SAMPLES)
+    rest, _, parameter_counts = _fit_quadrics(points, centres[sample], normals[sample], index[sample])
+    degrees = count - parameter_counts()
     variance = (rest**2).sum(axis=0) / degrees
     # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance / (1 - 2 / (9 * degrees)) ** 3)))
 
 
-def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> Array:
-    """Return (N, 3) unit normals of local quadrics at points `own` (N, 3), from those of the local planes.
+def _bent_normals(points: Array, centres: Array, normals: Array, index: Indices) -> Array:
+    """Return unit normals (N, 3) of local quadrics at points.
 
-    A scanner sees a bent surface in closer steps where it looks at it straight. The plane of a point's neighbours is
-    that of a place nearer to there: normals at a slant lean towards the scanner, by some hundredths of a radian.
+    The points of a bent surface are closer where it faces the scanner. The centroid of a point's neighbours is shifted
+    to there: normals of planes lean towards the scanner, by some hundredths of a radian.
+
+    Args:
+        points: (M, 3) all points.
+        centres: (N, 3) points at which the normals are returned.
+        normals: (N, 3) unit normals of the local planes at the centres.
+        index: (N, k) indices of each centre's neighbours among all points.
     """
     out = np.empty_like(normals)
-    for start in range(0, len(own), _IN_CACHE):
+    for start in range(0, len(centres), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
-        out[at] = _fit_quadrics(points, own[at], normals[at], index[at])[1]
+        out[at] = _fit_quadrics(points, centres[at], normals[at], index[at])[1]
     return out
 
 
 def _fit_quadrics(
-    points: Array, own: Array, normals: Array, index: Indices
+    points: Array, centres: Array, normals: Array, index: Indices
 ) -> tuple[Array, Array, Callable[[], Array]]:
-    """Return what quadrics through N points leave of their k neighbours, and how they bend.
+    """Return residuals and normals of quadrics fitted to the k neighbours of each of N points.
+
+    In axes x, y across the normal the height over the plane is a constant plus c·(x, y, x², √2·xy, y²). Least squares
+    with a small penalty: c = (S + μW)⁻¹q, and once more for the residuals (iterated Tikhonov), with μ `_NOT_SHOWN`. S
+    is the normal matrix of the terms less their means; W is that of the terms as they are, without products of first
+    and second order. So a coefficient that the neighbours hardly determine stays near zero, whatever the axes.
+
+    Args:
+        points: (M, 3) all points.
+        centres: (N, 3) points to whose neighbours the quadrics are fitted.
+        normals: (N, 3) unit normals of the local planes.
+        index: (N, k) indices of each centre's neighbours among all points.
 
     Returns:
-        Distances (k, N) from the quadrics along the normals, length_unit; unit normals (N, 3) of the quadrics at the
-        points; and a function that returns how many numbers (N,) each quadric took.
-
-    With c the coefficients of x, y, x², √2·xy, y², S their normal matrix beside a constant and W its blocks of first
-    and of second order without: c = (S + μW)⁻¹q, and again for what is left (iterated Tikhonov).
+        Residuals (k, N) along the normals, length_unit; unit normals (N, 3) of the quadrics at the centres; a function
+        that returns the effective number of parameters (N,) of each fit, which not all callers need.
     """
-    local = np.array([column[index.T] for column in points.T]) - own.T[:, None]
+    local = np.array([column[index.T] for column in points.T]) - centres.T[:, None]
     n = normals.T
     a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]]))
-    # A point that is seen edge-on has no normal.
+    # A point without a normal (zero) has no axes either: division by zero is avoided.
     a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     b = _cross(n, a)
     x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
@@ -322,17 +366,17 @@ def _fit_quadrics(
     slope /= scale
     bent = n - slope[0] * a - slope[1] * b
 
-    def numbers() -> Array:
-        # By a round, of each term.
+    def parameter_counts() -> Array:
+        """Return 1 + m − tr R⁴ (N,) for m terms, with R = μ(S + μW)⁻¹W what one round leaves of the coefficients."""
         left = np.stack([solve(_NOT_SHOWN * whole[:, j]) for j in range(len(terms))], axis=1)
         twice = np.einsum("ijn,jkn->ikn", left, left)
         return 1 + len(terms) - np.einsum("ijn,jin->n", twice, twice)
 
-    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, numbers
+    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, parameter_counts
 
 
 def _normal_matrices(terms: Array) -> Array:
-    """Return N normal matrices (m, m, N): the products of every two of m terms (m, k, N), summed over k neighbours."""
+    """Return N normal matrices (m, m, N): products of every two of m terms, (m, k, N), summed over k neighbours."""
     out = np.empty((len(terms), *terms[:, 0].shape))
     for i, term in enumerate(terms):
         out[i, : i + 1] = out[: i + 1, i] = np.einsum("kn,jkn->jn", term, terms[: i + 1])
@@ -340,7 +384,7 @@ def _normal_matrices(terms: Array) -> Array:
 
 
 def _solver(A: Array) -> Callable[[Array], Array]:
-    """Return what takes right sides (m, N) to solutions of N systems, A (m, m, N) symmetric, positive and small."""
+    """Return a function that solves A·x = right for N small systems, A (m, m, N) symmetric and positive definite."""
     # All systems at once by Cholesky factors: a library's loop over them takes several times as long.
     m = len(A)
     L = np.zeros_like(A)

@@ -18,19 +18,19 @@ from stitch.session.session import Scanner, SessionData, View
 
 @dataclass(frozen=True)
 class Scanners:
-    """The K scanners of V views; false for a session of one."""
+    """The K scanners of V views of a joined session; empty, and false, for a session of one scanner."""
 
     names: tuple[str, ...] = ()
-    of_view: Indices = field(default_factory=lambda: np.zeros(0, np.int64))  # (V,)
+    of_view: Indices = field(default_factory=lambda: np.zeros(0, np.int64))  # (V,) index of each view's scanner
     T_first: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (K, 4, 4) T_scanner1_scanner, to begin with
-    standoff: tuple[float | None, ...] = ()
+    standoff: tuple[float | None, ...] = ()  # length_unit; None: not stated
 
     def __bool__(self) -> bool:
         return bool(self.names)
 
     @property
     def behind(self) -> Array | None:
-        """(V, 4, 4) what stands right of the first scanner's hand-eye; None for one scanner."""
+        """(V, 4, 4) transforms multiplied to the right of the first scanner's hand-eye; None for one scanner."""
         return self.T_first[self.of_view] if self else None
 
     def only(self, keep: Sequence[int]) -> "Scanners":
@@ -43,7 +43,10 @@ class Scanners:
 
 
 def scanners_of(session: SessionData) -> Scanners:
-    """Return the scanners of a joined session; none for another."""
+    """Return the scanners of a session joined from several; an empty one of any other.
+
+    A hand-eye that is not stated counts as the identity: `T_first` is only where the fit begins.
+    """
     if not session.parts:
         return Scanners()
     mounts = [part.scanner.T_mount for part in session.parts]
@@ -57,9 +60,10 @@ def scanners_of(session: SessionData) -> Scanners:
 
 
 def stops_of(session: SessionData) -> Indices:
-    """Return the stop (V,) of each view of a joined session, counted from 0: at one stop scanners see one flange.
+    """Return the index (V,) of the stop of each view of a joined session, numbered in the order of their first view.
 
-    A stop has one scan of a scanner; where all views state their time the arm has been nowhere else in between.
+    Views of one stop have the same flange pose, and each comes from another scanner. Where all views state their time,
+    they follow each other: a pose that the arm returns to is another stop.
     """
     views = session.views
     same = same_stop(np.array([view.T_base_flange for view in views]))
@@ -70,6 +74,7 @@ def stops_of(session: SessionData) -> Indices:
         shared = [s for s in among if same[v, s[0]] and all(views[w].scanner != view.scanner for w in s)]
         stops += [] if shared else [[]]
         (shared or stops[-1:])[0].append(v)
+    # From lists of views per stop to the stop of each view.
     return np.repeat(np.arange(len(stops)), list(map(len, stops)))[np.argsort(np.concatenate(stops))]
 
 
@@ -79,7 +84,7 @@ def scanner_of(session: SessionData, view: View) -> Scanner:
 
 
 def have_own_hand_eyes(sessions: Sequence[SessionData]) -> bool:
-    """Return whether sessions are those of several scanners in one cell, which are stitched as one.
+    """Return True if sessions of scans are from different scanners in one cell, by their names: they are joined.
 
     Raises:
         InputError: a scanner without a name beside others, or two sessions of one scanner beside another's.
@@ -97,9 +102,10 @@ def have_own_hand_eyes(sessions: Sequence[SessionData]) -> bool:
 
 
 def join_sessions(sessions: Sequence[SessionData]) -> SessionData:
-    """Return the session of all views, each named VIEW@SCANNER: in the order of time where all state it.
+    """Return one session with the views of all, each named VIEW@SCANNER, sorted by time where all views state it.
 
-    Where the scanners stand to begin with is each session's `scanner.T_mount`.
+    All else is the first session's: arm, axes, and the hand-eye `scanner.T_mount`, which the others are counted from.
+    Noise and kind of the sensor stay only where all sessions agree.
     """
     first = sessions[0]
     views = [
@@ -126,5 +132,6 @@ def join_sessions(sessions: Sequence[SessionData]) -> SessionData:
         views=tuple(views),
         warnings=tuple(warning for session in sessions for warning in session.warnings),
         parts=tuple(sessions),
+        # What was guessed when the sessions were made, by key: of one key the last session's counts.
         usual=dict(guess for session in sessions for guess in session.usual.items()),
     )

@@ -29,16 +29,16 @@ class Cloud:
     normals: Array | None = None  # (N, 3) if the file has them
     scalars: dict[str, Array] = field(default_factory=dict)  # name -> (N,), e.g. intensity, time
     whole: "WholeCloud | None" = None  # None: these are all points that were scanned
-    codes: tuple[float, ...] = ()  # that stood for nothing measured
-    coded: int = 0  # points of the file that held one of them, and are none of these
+    codes: tuple[float, ...] = ()  # values in the file that mean "nothing measured"
+    coded: int = 0  # points of the file with such a value, left out of `points`
 
     @property
     def count(self) -> int:
-        """How many points were scanned."""
+        """The number of points that were scanned, in memory or not."""
         return len(self.points) if self.whole is None else self.whole.count
 
     def within(self, box: Array) -> "Cloud":
-        """Return the cloud of its points inside a box (2, 3)."""
+        """Return the cloud of its points inside a box (2, 3), lowest and highest corner, scanner frame."""
         return self.at(((self.points >= box[0]) & (self.points <= box[1])).all(axis=1))
 
     def at(self, index: Indices | Mask) -> "Cloud":
@@ -124,9 +124,10 @@ class Scanner:
     name: str = ""  # sessions of other scanners have hand-eyes of their own
 
     def eye(self, points: Array) -> Array:
-        """Return (3,) from where it looks at points (N, 3), scanner frame: the origin, if not amid what it measures.
+        """Return the point (3,), scanner frame, from which the scanner looks at points (N, 3).
 
-        A scanner with the origin of its frame in its measuring volume stands its working distance behind that.
+        The origin, unless that lies in the measuring volume: the points' median distance from it is below half of the
+        standoff. Then the scanner is one standoff behind the origin along its optical axis.
         """
         if self.standoff is None or not len(points):
             return np.zeros(3)
@@ -176,8 +177,10 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
 
     @property
     def reference_frame(self) -> str:
-        """Name of the frame in which the stitched cloud lies: the flange, the base, or an axis where there is no
-        robot."""
+        """Name of the frame in which the stitched cloud lies: "flange", "base", or without a robot that of an axis.
+
+        The axis is the first rotary one, else the first (`Axes.frame_axis`).
+        """
         if not self.has_poses:
             return next((axis for axis in self.axes if axis.is_rotary), self.axes[0]).name
         return "flange" if self.mount == "eye_to_hand" else "base"
@@ -199,7 +202,7 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
 
     @property
     def states_hand_eye(self) -> bool:
-        """True if session.toml states it, as far as a robot makes it one."""
+        """True if session.toml states a hand-eye of one scanner on a robot; of axes alone it only places an axis."""
         return self.scanner.T_mount is not None and self.has_poses and not self.parts
 
     def without(self, names: Collection[str]) -> "SessionData":
@@ -213,7 +216,7 @@ class SessionData(Value, document="stitch.api.check:session_summary"):
 
     @property
     def joints(self) -> Array | None:
-        """(V, n) rad; None where a view states none."""
+        """Joint angles (V, n) rad; None unless every view states them."""
         known = [view.joints for view in self.views if view.joints is not None]
         return np.array(known) if len(known) == len(self.views) else None
 

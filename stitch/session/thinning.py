@@ -30,13 +30,14 @@ _FIXED_BYTES = 1.2e9
 
 
 def points_within(memory: float, views: int) -> int:
-    """Return how many points of each view may stay in memory.
+    """Return how many points of each view may be held in memory, at most `MAX_POINTS`.
 
     Args:
         memory: bytes for the whole run.
+        views: number of views.
 
     Raises:
-        InputError: so many views need more.
+        InputError: the memory is too little for `_MIN_POINTS` of each view.
     """
     room = int((memory - _FIXED_BYTES) / (views * _BYTES_PER_POINT))
     if room < _MIN_POINTS:
@@ -62,11 +63,14 @@ def thin_session(session: SessionData, at_most: int = MAX_POINTS) -> tuple[Sessi
 def thin_cloud(
     name: str, cloud: Cloud, at_most: int, scanner: Scanner, reload: Callable[[], Cloud] | None = None
 ) -> Cloud:
-    """Return a cloud with at most `at_most` of its points, and where the whole is.
+    """Return a cloud with at most `at_most` of its points, spread evenly over the scan order.
+
+    Its `whole` says how all points are read again, and holds the scan whose normals come from all of them. A small
+    cloud is returned as it is.
 
     Args:
         name: of the view.
-        reload: reads the whole cloud again; None: it stays in memory.
+        reload: reads the cloud with all points again; None: that one stays in memory.
     """
     picked = even_indices(len(cloud.points), at_most)
     if len(picked) == len(cloud.points):
@@ -81,12 +85,12 @@ def thin_cloud(
 
 
 def distinct_points(cloud: Cloud) -> Cloud:
-    """Return the cloud with every point once, in its order; the same object where none stands twice.
+    """Return the cloud without repeated points, in its order; the same object where no point is repeated.
 
-    A copy says nothing more, and normals, noise and spacing would be taken from a point's own copies.
+    The nearest neighbours of a repeated point would be its copies: normals, noise and spacing would come from those.
     """
     x, y, z = cloud.points.T
-    # Of different points hardly any two agree in one number, which sorts ten times as fast as three.
+    # Different points hardly ever agree in this sum, and one number sorts ten times as fast as three.
     if len(np.unique(x + np.sqrt(2) * y + np.sqrt(3) * z)) == len(cloud.points):
         return cloud
     _, first = np.unique(cloud.points, axis=0, return_index=True)

@@ -20,31 +20,36 @@ STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
 
 @dataclass(frozen=True)
 class Torques:
-    """Torques under which joints sag: with masses one a joint, without them one a joint and a link beyond."""
+    """The m torques under which joints sag, in V views.
 
-    names: tuple[str, ...]
+    With known masses one for each joint; else one for each pair of a joint and a link that it carries, of 1 kg.
+    """
+
+    names: tuple[str, ...]  # "2" of joint 2; "2_4" of joint 2 by link 4
     joint: tuple[int, ...]  # that the torque bends
     values: Array  # (V, m) N·m about +z of that joint; of 1 kg at the link's frame where masses are unknown
-    measured: bool = False
+    measured: bool = False  # reported by the drives
     # Moments about the base's axes x and y: of arm and load where masses are known, else of 1 kg at each link's frame.
     base_names: tuple[str, ...] = ()  # _x, _y; without masses _x_3 of link 3, and _x, _y of a load that is known
-    base_axis: tuple[int, ...] = ()
+    base_axis: tuple[int, ...] = ()  # 0 for x, 1 for y
     base: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, k) N·m
 
     def only(self, keep: Sequence[int]) -> "Torques":
-        """Return those of some of the views."""
+        """Return the torques and moments of some of the views, by index."""
         return take_rows(self, keep, *(["values", "base"] if self.base_names else ["values"]))
 
     def followed_by(self, later: "Torques") -> "Torques":
-        """Return those of these views and of later ones."""
+        """Return the torques and moments of these views followed by those of later ones of the same arm."""
         base = np.concatenate([self.base, later.base]) if self.base_names else self.base
         return replace(self, values=np.concatenate([self.values, later.values]), base=base)
 
 
 def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
-    """Return gravity torques, N·m, at joint angles (V, n), rad; of 1 kg a link where masses are not known.
+    """Return the torques of gravity, N·m, at joint angles (V, n) rad.
 
-    Which torques are listed depends on the arm alone, not on the angles.
+    Links of known mass: the sum over links and payload for each joint. Unknown masses: one torque of 1 kg for each
+    joint and link; of a known payload also one for each joint that it bends. Which are listed depends on the arm alone,
+    not on the angles.
 
     Args:
         payload: (V,) kg, in place of the mass in [robot] payload.
@@ -59,7 +64,7 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
     if robot.has_masses:
         arm_alone = kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints)
         return replace(_each_joint(arm_alone + carried), **of_base)
-    # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
+    # The links' masses are unknown, the payload's is not: its torque has a compliance of its own at each joint.
     links = _unit_link_torques(robot, joints)
     shapes = kinematics.payload_torques(robot, _sample_joints(robot))
     bent = np.flatnonzero(np.ptp(shapes, axis=0) > STILL).tolist()
@@ -69,7 +74,11 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
 
 
 def _base_moments(robot: Robot, joints: Array, payload: Array | None) -> dict[str, Any]:
-    """Return the fields of `Torques` that say what tilts the base."""
+    """Return the fields base_names, base_axis and base of `Torques`: moments about the base's x and y that tilt it.
+
+    Args:
+        payload: (V,) kg; None: the mass in [robot] payload.
+    """
     of_kg = kinematics.base_moments(robot, joints)[..., :2]
     load = np.full(len(joints), robot.payload_mass) if payload is None else payload
     moments = load[:, None] * of_kg[:, -1]
@@ -87,14 +96,16 @@ def _base_moments(robot: Robot, joints: Array, payload: Array | None) -> dict[st
 
 
 def _each_joint(values: Array) -> Torques:
+    """Return torques (V, n) N·m, one for each joint, by the joint's number from 1."""
     joints = range(values.shape[1])
     return Torques(tuple(str(i + 1) for i in joints), tuple(joints), values)
 
 
 def _unit_link_torques(robot: Robot, joints: Array) -> Torques:
-    """Return torques, N·m, of 1 kg at the frame of link k about joint i, named i_k, one for each independent pair.
+    """Return the torques, N·m, about joint i of 1 kg at the frame of link k, named "i_k", at joint angles (V, n) rad.
 
-    Without masses their shapes over the views alone are known.
+    Without masses a torque is known but for a factor. Only pairs count whose torque is not a combination of those of
+    other links about the same joint.
     """
     n = robot.n_joints
     shapes = kinematics.unit_torques(robot, _sample_joints(robot))
@@ -105,9 +116,13 @@ def _unit_link_torques(robot: Robot, joints: Array) -> Torques:
 
 
 def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
-    """Return the links whose unit torque (V, n) about one joint changes and is no combination of those before it.
+    """Return the links whose torque about one joint varies and is no linear combination of those chosen before.
 
-    Frames of a wrist share their origin: a second torque from the same place would only make both unknown.
+    Frames of a wrist share their origin: factors of two torques from the same place could not be told apart.
+
+    Args:
+        torques: (V, n) N·m of 1 kg at each link, about one joint.
+        links: indices to choose from, in this order.
     """
     chosen = list[int]()
     basis = np.zeros((len(torques), 0))
@@ -121,15 +136,16 @@ def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
 
 
 def _sample_joints(robot: Robot) -> Array:
-    """Return (N, n) joint angles from everywhere: a coefficient must mean the same in every session of an arm."""
+    """Return fixed random joint angles (N, n), rad: which torques differ is then the same in all sessions of an arm."""
     return np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, robot.n_joints))
 
 
 def torques_of_views(robot: Robot, joints: Array, covariates: Mapping[str, Array]) -> Torques:
-    """Return the torques at joint angles (V, n), as drives report them or of gravity.
+    """Return the torques that bend the joints at angles (V, n) rad: as the drives report them, else those of gravity.
 
     Args:
-        covariates: (V,) by name: jN_torque_nm of all joints is what drives report, payload_kg what the flange carries.
+        covariates: column of views.csv -> (V,). jN_torque_nm, if all joints have it, is reported by the drives;
+            payload_kg is the mass that the flange carries.
     """
     drives = [name for name in torque_columns(joints.shape[1]) if name in covariates]
     if not drives or len(drives) < joints.shape[1]:

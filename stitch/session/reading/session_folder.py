@@ -16,7 +16,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
-from stitch.session.axis_poses import as_stated, require_placed
+from stitch.session.axis_poses import place_stated_axes, require_placed
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.csv_files import read_csv_lines
@@ -108,7 +108,7 @@ def load_session(
         usual=usual_guesses(file, document),
     )
     if axes:
-        session = as_stated(replace(session, has_poses=has_poses), axes)
+        session = place_stated_axes(replace(session, has_poses=has_poses), axes)
         if scanner.moving:
             require_placed(session)
     if scans:
