@@ -27,7 +27,7 @@ from stitch.plugins.intake.session_guesses import score_words
 from stitch.plugins.intake.stops import AROUND, middle_of_stops, stationary_scans
 from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.depth_image import lifted
+from stitch.session.reading.depth_image import points_of_image
 from stitch.session.reading.intrinsics import Intrinsics
 from stitch.session.reading.robot_description import moving_joints, poses_of_urdf
 from stitch.session.reading.session_toml import SESSION_FORMAT
@@ -418,7 +418,7 @@ def depth_array(message: Any, camera: Any, where: str) -> Array:
     distortion = np.asarray(d, float) if np.any(d) else np.zeros(0)
     fx, cx, fy, cy = (float(K[i]) for i in (0, 2, 4, 5))
     lens = Intrinsics(Path(where), fx, fy, cx, cy, distortion, size=None, units_per_metre=None)
-    return lifted(where, z, lens)
+    return points_of_image(where, z, lens)
 
 
 def write_bag_session(

@@ -36,10 +36,15 @@ _EXR_WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
 
 
 def require_room(path: Path, points: int) -> None:
-    """Refuse a number of points that the file cannot hold, packed or not.
+    """Refuse a file whose header announces more points than its bytes can hold, compressed or not.
+
+    Asked before a library allocates memory for them.
+
+    Args:
+        points: number that the header announces.
 
     Raises:
-        InputError: with how many the header announces.
+        InputError: names that number.
     """
     size = path.stat().st_size
     if points > min(MOST_POINTS, _POINTS_A_BYTE * size):
@@ -80,7 +85,7 @@ def require_e57_room(path: Path) -> None:
     pages = [raw[:first], *(raw[i : i + page] for i in range(first, len(raw), page))]
     text = b"".join(piece[:-_E57_CHECKSUM] for piece in pages)[:length]
     counts = re.findall(rb'recordCount\s*=\s*["\']\s*([^"\']*)', text)
-    # A number may be spelt by entities, a text by entities of entities.
+    # XML entities could hide a number, or unpack to a text of any length: files with entities are refused.
     if b"<!" in text.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or not all(count.isdigit() for count in counts):
         raise InputError(f"{path}: its description has entities, or a number of points that is none; export it again")
     require_room(path, max(map(int, counts), default=0))
@@ -99,10 +104,12 @@ def require_exr_room(path: Path) -> None:
 
 
 def require_array_room(path: Path) -> None:
-    """Refuse a .mat or .npz whose arrays take more room than tables of poses do, before it is made.
+    """Refuse a .mat or .npz whose arrays are larger than any table of poses, before memory is allocated for them.
+
+    Other files, and damaged ones, are left to their reader.
 
     Raises:
-        InputError: with how many bytes are announced; what is no such file is left to its reader.
+        InputError: names the bytes that are announced.
     """
     count = {".mat": _mat_bytes, ".npz": _zip_bytes}.get(path.suffix.lower())
     if count is not None and (announced := count(path)) > _MOST_BYTES:
@@ -110,13 +117,13 @@ def require_array_room(path: Path) -> None:
 
 
 def require_workbook_room(path: Path) -> None:
-    """Refuse a workbook whose sheets take more room than tables of poses do, before it is made.
+    """Refuse a workbook whose sheets are larger than any table of poses, before memory is allocated for them.
 
-    One number in the last cell of an empty sheet makes 17 billion cells of it, and no reader that asks for so much
-    memory comes back.
+    One number in the last cell of an empty sheet makes 17 billion cells: a reader would be ended by the system. What
+    is no ZIP archive is left to its reader.
 
     Raises:
-        InputError: with how much is announced; what is no archive is left to its reader.
+        InputError: names the bytes, or the cells, that are announced.
     """
     if (unpacked := _zip_bytes(path)) > _MOST_BYTES:
         raise InputError(f"{path}: {unpacked} bytes of sheets announced; to fix: save the poses alone, as CSV")
@@ -130,7 +137,7 @@ def require_workbook_room(path: Path) -> None:
 
 
 def _cells(sheet: bytes) -> int:
-    """Cells of the rectangle that ends at the last filled row and column of a sheet of Office Open XML."""
+    """Return the number of cells from A1 to the last filled row and column of a sheet, bytes of Office Open XML."""
     letters = set[bytes]()
     rows = 0
     for cell in _FILLED_CELL.finditer(sheet):
@@ -145,7 +152,10 @@ def _column(letters: bytes) -> int:
 
 
 def _mat_bytes(path: Path) -> int:
-    """Sum of the elements of a MAT-file of version 5, as they announce themselves inside where they are packed."""
+    """Return the bytes that the elements of a MAT-file of version 5 unpack to; 0 for any other file.
+
+    Each element begins with a tag of type and size. A compressed one holds another such tag, of its unpacked data.
+    """
     total, size = 0, path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(_MAT_HEADER)

@@ -15,7 +15,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.reading.clouds import cloud_of_columns
-from stitch.session.reading.depth_image import lifted
+from stitch.session.reading.depth_image import points_of_image
 from stitch.session.reading.intrinsics import Intrinsics, intrinsics_of_level
 from stitch.session.reading.scan_files import measured_pixels
 from stitch.session.reading.text_files import require_name
@@ -42,8 +42,9 @@ def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
     of which x, y and z are NaN, are left out.
 
     Args:
+        item: an array, mapping or object of a library as `_KNOWN` lists them.
         where: the scan's name, for messages.
-        scale: turns the unit of the item into the session's.
+        scale: factor from the unit of the item to the session's length_unit.
 
     Raises:
         InputError: a kind that is not known, another shape, no points, or points that are not finite.
@@ -56,7 +57,10 @@ def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
 
 
 def _columns(item: Any, where: str) -> Columns:
-    """Return columns (N,) by name."""
+    """Return the columns of a scan, name -> (N,): x, y, z, nx, ny, nz, red, green, blue, and any scalar.
+
+    By its kind: a cloud of ours, a mapping, (depth image, intrinsics), an object of Open3D or trimesh, else an array.
+    """
     if isinstance(item, Cloud):
         cloud = item if item.whole is None else item.whole.read()
         normals = {} if cloud.normals is None else dict(zip(_NORMALS, cloud.normals.T, strict=True))
@@ -81,7 +85,10 @@ def _columns(item: Any, where: str) -> Columns:
 
 
 def _unmasked(values: Any) -> Any:
-    """Return an array as it is; NaN where a masked one is masked, and in the other two numbers of that row."""
+    """Return an array without its mask: NaN where it is masked; an array without a mask as it is.
+
+    Of points (..., 3) with one masked number all three become NaN; of a structured array masked rows are left out.
+    """
     if not np.ma.isMaskedArray(values):
         return np.asarray(values)
     if values.dtype.names is not None:
@@ -93,14 +100,22 @@ def _unmasked(values: Any) -> Any:
 
 
 def _points(points: Array, where: str) -> Columns:
-    """Return columns x, y, z of (N, 3), or of every pixel of (H, W, 3), measured or not."""
+    """Return columns x, y, z of points (N, 3), or of all pixels of (H, W, 3), NaN included.
+
+    Raises:
+        InputError: another shape or type.
+    """
     if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
         raise InputError(f"{where}: {_array_kind(points)} is no cloud that is known; to fix: pass {_KNOWN}")
     return dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
 
 
 def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
-    """Return columns of a mapping: points, normals and colors are three each, every other entry is one."""
+    """Return the columns of a mapping: three each from points, normals and colors, one from every other entry.
+
+    Raises:
+        InputError: columns of different lengths.
+    """
     rest = {str(name): _unmasked(values) for name, values in item.items()}
     columns = _points(rest.pop("points"), where) if "points" in rest else {}
     count = len(columns.get("x", ()))
@@ -116,7 +131,10 @@ def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
 
 
 def _colours(colours: Any, where: str) -> Columns:
-    """Return red, green, blue, 0 … 255, of bytes as they are and of floats from 0 to 1; an opacity is left out."""
+    """Return columns red, green, blue, 0 … 255, of colours (..., 3 or 4): integers as they are, floats times 255.
+
+    A fourth value, the opacity, is left out.
+    """
     values = np.asarray(colours)
     if values.dtype.kind == "f":
         values = np.round(values * 255)
@@ -124,13 +142,18 @@ def _colours(colours: Any, where: str) -> Columns:
 
 
 def _triple(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
+    """Return three columns by their names from values (..., 3); `what` names them in the error."""
     if values.ndim < 2 or values.shape[-1] != 3:
         raise InputError(f"{where}: {what} of shape {values.shape}; to fix: pass three numbers a point")
     return dict(zip(names, values.reshape(-1, 3).T, strict=True))
 
 
 def _of_open3d(item: Any, where: str) -> Columns:
-    """Return the columns of a PointCloud, legacy or of tensors."""
+    """Return the columns of a PointCloud of Open3D: of open3d.geometry, or of open3d.t.geometry with its attributes.
+
+    Raises:
+        InputError: an image, or another kind of object.
+    """
     if hasattr(item, "depth"):
         raise InputError(f"{where}: an image has no points without its lens; to fix: pass (image, intrinsics)")
     if hasattr(item, "has_normals"):
@@ -146,14 +169,19 @@ def _of_open3d(item: Any, where: str) -> Columns:
 
 
 def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
-    """Return the columns of a depth image lifted through its lens, and its colours; 0 where nothing was measured."""
+    """Return the columns of the points of a depth image, with brightness or colours of an RGB-D image of its size.
+
+    Args:
+        image: (H, W) array or image of depths, or an RGBDImage; 0 where nothing was measured.
+        intrinsics: as `_intrinsics` takes them.
+    """
     depth = _pixels(getattr(image, "depth", image))
     colour = getattr(image, "color", None)
     if depth.ndim != 2:
         raise InputError(
             f"{where}: {_array_kind(depth)} is no depth image; to fix: pass (H, W) numbers with intrinsics"
         )
-    points = lifted(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
+    points = points_of_image(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
     measured = np.isfinite(points[:, 2])
     columns = dict(zip("xyz", points[measured].T, strict=True))
     pixels = np.zeros(0) if colour is None else _pixels(colour)
@@ -165,7 +193,7 @@ def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
 
 
 def _pixels(image: Any) -> Array:
-    """Return (H, W) or (H, W, C) of an array or an image of Open3D."""
+    """Return the pixels (H, W), or (H, W, C) of C > 1 channels, of an array or of an image of Open3D."""
     for way in ("as_tensor", "cpu"):
         image = getattr(image, way)() if hasattr(image, way) else image
     values = image.numpy() if hasattr(image, "numpy") else np.asarray(image)
@@ -173,7 +201,15 @@ def _pixels(image: Any) -> Array:
 
 
 def _intrinsics(item: Any, where: str) -> Intrinsics:
-    """Return the lens of a PinholeCameraIntrinsic, a matrix (3, 3), RealSense's intrinsics, or what a file states."""
+    """Return the intrinsics from an object as people pass it.
+
+    Args:
+        item: a PinholeCameraIntrinsic of Open3D, a camera matrix (3, 3), RealSense's intrinsics, or a mapping with the
+            names of a file of intrinsics.
+
+    Raises:
+        InputError: none of these, or without focal lengths.
+    """
     if hasattr(item, "ppx"):
         item = {name: getattr(item, name, None) for name in (*_OF_REALSENSE, "model", "width", "height")}
     if hasattr(item, "intrinsic_matrix"):
@@ -196,9 +232,10 @@ def _plain(value: Any) -> Any:
 
 
 def poses_of(poses: Any, where: str) -> Array:
-    """Return poses (V, 4, 4) of matrices, scipy's RigidTransform, (Rotation, translation), or a list of any of these.
+    """Return poses (V, 4, 4) from matrices, scipy's RigidTransform, (Rotation, translation), or a list of any of these.
 
-    Matrices that are stored by columns are told by their row 0 0 0 1, as `stitch init` tells them.
+    Matrices that are stored by columns, with 0 0 0 1 as their last column, are transposed. Rotations that are exact
+    stay to the last digit; others are made orthonormal.
 
     Args:
         where: for messages.
@@ -226,7 +263,7 @@ def poses_of(poses: Any, where: str) -> Array:
 
 
 def _are_motions(T: Array) -> bool:
-    """Return True of matrices with the last row 0 0 0 1 and nearly a rotation beside it."""
+    """Return True if all matrices (V, 4, 4) have the last row 0 0 0 1 and, within `_NEARLY_ORTHONORMAL`, a rotation."""
     R = T[:, :3, :3]
     last_row = np.allclose(T[:, 3], _LAST_ROW, atol=1e-6)
     return last_row and _off_orthonormal(R) < _NEARLY_ORTHONORMAL and bool((np.linalg.det(R) > 0).all())
@@ -237,7 +274,11 @@ def _off_orthonormal(R: Array) -> float:
 
 
 def _matrices(poses: Any, where: str) -> Array:
-    """Return (V, 4, 4) of many poses, (4, 4) of one."""
+    """Return the matrices (V, 4, 4) of many poses, (4, 4) of one, unchecked.
+
+    Raises:
+        InputError: they are no numbers, or of different shapes.
+    """
     if hasattr(poses, "as_matrix") and not isinstance(poses, Rotation):
         return poses.as_matrix()
     if isinstance(poses, tuple) and len(poses) == 2 and isinstance(poses[0], Rotation):
@@ -251,7 +292,7 @@ def _matrices(poses: Any, where: str) -> Array:
         return frames.make(rotations, shifts)
     try:
         if isinstance(poses, Sequence) and not isinstance(poses, str):
-            # Of one object a view, or of one array a view.
+            # A list may mix objects with a pose each, converted one by one, and arrays.
             is_object = [
                 hasattr(p, "as_matrix") or (isinstance(p, tuple) and isinstance(p[0], Rotation)) for p in poses
             ]
@@ -267,7 +308,7 @@ def _matrices(poses: Any, where: str) -> Array:
 
 
 def _no_motion(T: Array) -> str:
-    """Say why the worst of the matrices is no rigid motion."""
+    """Return why the worst of matrices (V, 4, 4) is no rigid motion: by its rotation, its determinant and last row."""
     R = T[:, :3, :3]
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - _LAST_ROW).max(axis=1)
     det = np.linalg.det(R)
@@ -277,10 +318,10 @@ def _no_motion(T: Array) -> str:
 
 
 def sighting_of(item: Any, where: str) -> Sighting | None:
-    """Return the labelled points of one view: of a mapping from target to (3,), sensor frame; None where it has none.
+    """Return the labelled points of one view, sensor frame; None where it has none. Their sigmas are not known, NaN.
 
     Args:
-        item: such a mapping, a `Sighting` with sigmas of its own, or None.
+        item: a mapping from target to its point (3,), a `Sighting`, which is returned as it is, or None.
 
     Raises:
         InputError: a place that is not three finite numbers.
@@ -299,7 +340,7 @@ def sighting_of(item: Any, where: str) -> Sighting | None:
 
 
 def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
-    """Return numbers of which there is one row a view, as an array of `ndim` axes; NaN where one is masked.
+    """Return numbers with one row per view as a float array (count, ...) of `ndim` axes; NaN where one is masked.
 
     Raises:
         InputError: another number of rows, another shape, or dates, which count in no unit.
@@ -319,7 +360,7 @@ def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
 
 
 def seconds_of(times: Any, count: int, where: str) -> Array:
-    """Return times (V,) s: numbers as they are, durations in seconds, dates in seconds since the first of them.
+    """Return times (count,) s: numbers as they are, durations in seconds, dates in seconds since the first of them.
 
     Raises:
         InputError: as of `per_view`.

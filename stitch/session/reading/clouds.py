@@ -83,12 +83,14 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
 
 
 def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float = 1.0) -> Cloud:
-    """Return a cloud from its columns (N,) by name: x, y, z, normals, and any scalar; points at 0 0 0 are left out.
+    """Return a cloud from its columns, name -> (N,): x, y, z, normals if there are three, all others as scalars.
+
+    Points at 0 0 0 are left out, and those with a code for "nothing measured" (`_without_codes`).
 
     Args:
         where: file, or name of the scan, for messages.
-        columns: is emptied of what is taken, so that large scans are not held twice.
-        scale: turns the unit of the columns into the session's.
+        columns: entries that are used are removed from it, so that large scans are not held twice.
+        scale: factor from the unit of the columns to the session's length_unit.
 
     Raises:
         InputError: no x, y, z, no points, or points that are not finite.
@@ -105,7 +107,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
         raise InputError(f"{where}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
-    # Structured exports write 0 0 0 for a pixel that measured nothing; the scanner's own place has no ray.
+    # Structured exports write 0 0 0 for a pixel that measured nothing; no point is measured at the scanner's origin.
     x, y, z = points.T
     measured = (x != 0) | (y != 0) | (z != 0)
     if not measured.any():
@@ -123,10 +125,10 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
 
 
 def _without_codes(columns: dict[str, Array]) -> tuple[dict[str, Array], tuple[float, ...]]:
-    """Return the columns without points that are a code, as -99999 three times or z = -32.768, and the codes.
+    """Return the columns without points that hold a code for "nothing measured", as z = −32.768, and the codes, sorted.
 
-    A code is the least or largest value of a coordinate, the same to the last digit in several points, be it a few of
-    them or most, and far outside of what the rest spans.
+    A code is the least or the largest value of a coordinate, equal to the last digit in several points, and far outside
+    the range of the others. Columns of another length stay as they are.
     """
     coded = np.zeros(len(columns["x"]), bool)
     codes = set[float]()
@@ -142,7 +144,11 @@ def _without_codes(columns: dict[str, Array]) -> tuple[dict[str, Array], tuple[f
 
 
 def _code(values: Array) -> float | None:
-    """Return the one of values (N,) that stands for nothing measured, if one does."""
+    """Return the value among coordinates (N,) that is a code for "nothing measured"; None if there is none.
+
+    The least or the largest value, in at least `_CODE_TIMES` points, `_CODE_AWAY` ranges away from the others. These
+    must be `_CODE_REST` of all, with `_CODE_VALUES` different values in a sample, so that they have a range at all.
+    """
     for extreme in (np.fmin.reduce(values), np.fmax.reduce(values)) if len(values) else ():
         # Whole scans are looked at, and hardly any has a code: first what costs least.
         if not np.isfinite(extreme) or np.count_nonzero(values == extreme) < _CODE_TIMES:

@@ -17,7 +17,7 @@ _LONGEST_HEADER = 1 << 20
 
 
 def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return names of the columns, and line number and cells of every line that is not empty.
+    """Return the names of the columns, and a list of (line number from 1, its cells) of all lines that are not empty.
 
     Raises:
         InputError: the file is not text, is not separated by commas, a quote stays open, or a row has more or fewer
@@ -47,7 +47,10 @@ def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _require_commas(file: Path, header: str) -> None:
-    """Refuse a table whose first line holds semicolons or tabs and no comma, as spreadsheets of many countries do.
+    """Refuse a table separated by semicolons or tabs, as spreadsheets of many countries write them.
+
+    Args:
+        header: its first line, which holds no comma then.
 
     Raises:
         InputError: names what it is separated by, and how to fix it.
@@ -69,7 +72,7 @@ def _require_commas(file: Path, header: str) -> None:
 
 
 def _require_cells(file: Path, line: int, row: list[str], header: list[str]) -> None:
-    """Refuse a row of a table that has more or fewer cells than its header."""
+    """Refuse a row of a table that has more or fewer cells than its header; `line` is its number in the file."""
     if len(row) != len(header):
         raise InputError(
             f"{file} line {line}: {len(row)} cells, the header has {len(header)}; to fix: write one cell a column, in "
@@ -87,7 +90,12 @@ def is_number(cell: str) -> bool:
 
 
 def finite_number(file: Path, line: int, column: str, cell: str, remedy: str = "write a finite number") -> float:
-    """Return the finite number of a cell.
+    """Return the number in a cell, finite and below `_LARGEST`.
+
+    Args:
+        line: number of its line in the file, for the message.
+        column: name of its column, for the message.
+        remedy: how to fix another cell.
 
     Raises:
         InputError: names file, line and column, and how to fix it.

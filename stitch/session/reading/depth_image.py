@@ -25,7 +25,10 @@ _CHANNELS = ("Z", "Y", "depth", "Depth", "R", "RGB")
 
 
 def is_depth_image(path: Path) -> bool:
-    """Return True if the file's head says one number a pixel, of more than 8 bits; colours are none."""
+    """Return True if a file holds an image with one number per pixel, of more than 8 bits; all EXR count.
+
+    Only the head of the file is read. Of a .npy: a table with more columns than points have, and several rows.
+    """
     from PIL import Image, UnidentifiedImageError
 
     kind = path.suffix.lower()
@@ -47,7 +50,9 @@ def is_depth_image(path: Path) -> bool:
 
 
 def read_depth(path: Path) -> Array:
-    """Return (H, W, 3) points, camera frame, NaN where nothing was measured; an EXR may hold them as they are.
+    """Return the points (H, W, 3) of a depth image, camera frame, NaN where nothing was measured.
+
+    In the file's unit, or in metres where the intrinsics state a depth scale. An EXR may hold the points themselves.
 
     Raises:
         InputError: no depth image, no intrinsics, or those of another size of image.
@@ -55,7 +60,7 @@ def read_depth(path: Path) -> Array:
     pixels = _pixels(path)
     if pixels.ndim == 3:
         return np.where(pixels.any(axis=2, keepdims=True), pixels, np.nan)
-    return lifted(path, pixels, find_intrinsics(path))
+    return points_of_image(path, pixels, find_intrinsics(path))
 
 
 def read_depth_columns(path: Path) -> dict[str, Array]:
@@ -65,7 +70,11 @@ def read_depth_columns(path: Path) -> dict[str, Array]:
 
 
 def _pixels(path: Path) -> Array:
-    """Return (H, W) numbers as stored, or (H, W, 3) points."""
+    """Return the numbers (H, W) of a depth image as they are stored; of an EXR that holds them, points (H, W, 3).
+
+    Raises:
+        InputError: a picture, with colours or 8 bits.
+    """
     from PIL import Image
 
     if path.suffix.lower() == ".npy":
@@ -94,23 +103,49 @@ def _exr(path: Path) -> Array:
     return pixels[..., :3] if is_colour else pixels if pixels.ndim == 2 else pixels[..., 0]
 
 
-def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
-    """Return (H, W, 3) points of a depth image (H, W), camera frame, NaN where nothing was measured.
+def points_of_image(where: Path | str, image: Array, camera: Intrinsics) -> Array:
+    """Return the points (H, W, 3) of a depth image, or of a height map if the intrinsics have a pitch.
+
+    Scanner frame; NaN where nothing was measured.
 
     Args:
         where: file, or name of the scan, for messages.
-        depth: distance along the axis; 0, negative or NaN where nothing was measured.
+        image: (H, W) depths or heights as stored.
+
+    Raises:
+        InputError: the intrinsics are those of another size of image.
+    """
+    return _points_of_depths(where, image, camera) if camera.pitch is None else _points_of_heights(image, camera.pitch)
+
+
+def _points_of_heights(heights: Array, pitch: tuple[float, float, float]) -> Array:
+    """Return the points (H, W, 3) of a height map in the unit of the pitch, NaN where nothing was measured.
+
+    x = column · pitch x, y = −row · pitch y, since rows run down, z = height · pitch z.
+
+    Args:
+        heights: (H, W) counts of either sign; 0 or NaN where nothing was measured.
+        pitch: from pixel to pixel along x and y, and z of one count.
+    """
+    step_x, step_y, step_z = pitch
+    rows, columns = np.indices(heights.shape)
+    z = np.where(np.isfinite(heights) & (heights != 0), heights * step_z, np.nan)
+    return np.dstack([columns * step_x, -rows * step_y, z])
+
+
+def _points_of_depths(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
+    """Return the points (H, W, 3) of a depth image, camera frame, NaN where nothing was measured.
+
+    In metres where the camera states its units per metre, else in the unit of the depth.
+
+    Args:
+        where: file, or name of the scan, for messages.
+        depth: (H, W) distance along the optical axis; 0, negative or NaN where nothing was measured.
 
     Raises:
         InputError: the intrinsics are those of another size of image.
     """
     height, width = depth.shape
-    if camera.pitch is not None:
-        # Rows of an image run down, heights up.
-        x, y, up = camera.pitch
-        rows, columns = np.indices(depth.shape)
-        z = np.where(np.isfinite(depth) & (depth != 0), depth * up, np.nan)
-        return np.dstack([columns * x, -rows * y, z])
     if camera.size is not None and camera.size != (width, height):
         raise InputError(
             f"{where}: {width}×{height} pixels, {camera.source.name} is of {camera.size[0]}×{camera.size[1]}; to fix: "
@@ -128,7 +163,7 @@ def lifted(where: Path | str, depth: Array, camera: Intrinsics) -> Array:
 
 
 def _rays(camera: Intrinsics, width: int, height: int) -> Array:
-    """Return (H, W, 2): x/z and y/z of every pixel."""
+    """Return x/z and y/z (H, W, 2) of the ray of each pixel, camera frame, the lens's distortion undone."""
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     if not len(camera.distortion):
         return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=2)

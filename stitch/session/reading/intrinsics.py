@@ -49,7 +49,9 @@ class Intrinsics:
 
 
 def find_intrinsics(image: Path) -> Intrinsics:
-    """Return the intrinsics of an image: of a file of its own name, of its folder, or of the folder above.
+    """Return the intrinsics of an image, from the first place that has some.
+
+    The places: a file of the image's name, its folder, the folder above. In a folder names with "depth" go first.
 
     Raises:
         InputError: none, several, or one that cannot be read.
@@ -74,7 +76,7 @@ def find_intrinsics(image: Path) -> Intrinsics:
 
 
 def _read_intrinsics(file: Path) -> Intrinsics | None:
-    """Return what a file states; None where it holds no intrinsics."""
+    """Return the intrinsics that a JSON, YAML or text file states; None where it holds none, or is too large."""
     if file.stat().st_size > _LARGEST_MB * 1e6:
         return None
     try:
@@ -95,7 +97,7 @@ def _read_intrinsics(file: Path) -> Intrinsics | None:
 
 
 def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
-    """Yield every mapping of a document, those of the depth first."""
+    """Yield every mapping of a document at any depth, keys in small letters; inner ones named after depth first."""
     if isinstance(document, dict):
         plain = {str(key).lower(): value for key, value in document.items()}
         yield plain
@@ -104,7 +106,15 @@ def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
 
 
 def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
-    """Return the lens or the pitch that a mapping with lower-case names states, None where it states neither."""
+    """Return the camera, or the pitch of a height map, that one mapping states; None where it states neither.
+
+    Args:
+        file: for messages.
+        level: a mapping of a document, with keys in small letters.
+
+    Raises:
+        InputError: numbers that no lens has.
+    """
     matrix = _camera_matrix(level)
     named = {m[2] or m[3]: level[name] for name in level if (m := _PITCH.match(name))} if matrix is None else {}
     if {"x", "y"} <= named.keys() and all(isinstance(step, (int, float)) and step > 0 for step in named.values()):
@@ -133,7 +143,7 @@ def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
 
 
 def _camera_matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
-    """Return fx, fy, cx, cy; None where a mapping has none."""
+    """Return fx, fy, cx, cy, pixels, of a mapping that names them or holds a camera matrix; None where it has none."""
     inner = level.get("cameramatrix")
     if isinstance(inner, dict):
         level = {str(key).lower(): value for key, value in inner.items()}
@@ -190,7 +200,13 @@ def _whole_number(level: dict[str, Any], *names: str) -> int | None:
 
 
 def _units_per_metre(file: Path, level: dict[str, Any]) -> float | None:
-    """Return how many units of depth are a metre, whichever way the file says it; None where it does not."""
+    """Return how many units of depth make a metre; None where the file does not say it.
+
+    `depth_scale` may be that number, as 1000, or its inverse, as 0.001.
+
+    Raises:
+        InputError: a value in between, which could be neither.
+    """
     value = level.get("depth_scale")
     if value is None:
         return None

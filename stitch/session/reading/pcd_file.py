@@ -27,7 +27,7 @@ def read_pcd(path: Path) -> dict[str, Array]:
     raw = path.read_bytes()
     header, encoding, start = _header(path, raw)
     layout, count = _binary_layout(path, header)
-    # By name, the field's number as text: so the layout calls it, since padding has one name for several fields.
+    # Name -> number of the field as text, its name in the layout: several fields of padding share one name "_".
     kept = {name: str(i) for i, name in enumerate(header["FIELDS"]) if not layout[i].shape and name != "_"}
     body = raw[start:]
     if encoding == "ascii":
@@ -43,7 +43,11 @@ def read_pcd(path: Path) -> dict[str, Array]:
 
 
 def _header(path: Path, raw: bytes) -> tuple[dict[str, list[str]], str, int]:
-    """Return the words of each line by its first, the encoding, and where the data begin."""
+    """Return the header as first word of a line -> its other words, the encoding, and the byte where the data begin.
+
+    Raises:
+        InputError: no line DATA.
+    """
     header: dict[str, list[str]] = {}
     start = 0
     while True:
@@ -59,7 +63,11 @@ def _header(path: Path, raw: bytes) -> tuple[dict[str, list[str]], str, int]:
 
 
 def _binary_layout(path: Path, header: dict[str, list[str]]) -> tuple[np.dtype[np.void], int]:
-    """Return the fields of a point, called 0, 1 … in their order, and the number of points."""
+    """Return the dtype of one point, its fields called "0", "1" … in their order, and the number of points.
+
+    Raises:
+        InputError: the header lacks an entry, or holds a wrong number.
+    """
     try:
         fields = header["FIELDS"]
         counts = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]

@@ -24,10 +24,13 @@ _SATURATED = 0.5
 
 
 def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
-    """Return a scan as an image; None where its file holds no pixels, or no brightness lies in it or beside it.
+    """Return a scan as an image of points and brightness.
+
+    The brightness is in the file, or in a picture beside it. None where the scan is not stored pixel by pixel, or has
+    no brightness.
 
     Args:
-        scale: turns the file's unit into the session's.
+        scale: factor from the file's unit to the session's length_unit.
 
     Raises:
         InputError: a file that cannot be read, or a picture of another size than its scan.
@@ -57,9 +60,9 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
 
 
 def _read_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
-    """Return points (H, W, 3) in the file's unit and brightness (H, W) of a file that holds an image.
+    """Return the points (H, W, 3) of a file, in its unit, and their brightness (H, W).
 
-    None for the points of another file; None for a brightness that it does not hold.
+    Points are None where the file is not stored pixel by pixel; the brightness is None where the file holds none.
     """
     kind = path.suffix.lower()
     if kind in DEPTH_SUFFIXES or (kind == ".npy" and is_depth_image(path)):
@@ -112,7 +115,7 @@ def _array_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
 
 
 def _brightness_of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | None:
-    """Return the brightness (N,) of points by their colours or a grey column (N,); None without either."""
+    """Return the brightness (N,), 0 to 255, of points from columns of colours, or of grey; None without either."""
     for names in _RGB:
         if all(name in columns for name in names):
             return _grey(np.array([columns[name] for name in names], float))
@@ -127,9 +130,9 @@ def _brightness_of_columns(columns: dict[str, Array]) -> NDArray[np.uint8] | Non
 
 
 def _grey(channels: Array) -> NDArray[np.uint8]:
-    """Return the brightness of one channel or of three (c, …), 0 to 255.
+    """Return the mean (...) of one channel or of three (c, ...) as brightness 0 to 255.
 
-    Values from 0 to 1, and counts of more than 8 bits, are scaled so that nearly the brightest is 255.
+    Values up to 1, and those above 255, are scaled: the brightest but for `_SATURATED` per cent of them become 255.
     """
     values = np.nan_to_num(channels.mean(axis=0))
     top = float(np.percentile(values, 100 - _SATURATED)) if values.size else 0.0
@@ -138,7 +141,11 @@ def _grey(channels: Array) -> NDArray[np.uint8]:
 
 
 def _find_picture(scan: Path) -> Path | None:
-    """Return the colour or grey image of a scan: named like it with another ending, or by colour and its number."""
+    """Return the picture of a scan, colour or grey; None without one.
+
+    In its folder, or one beside that which is named after colour. It has the scan's name with another ending, or a name
+    after colour with the same last number.
+    """
     numbers = re.findall(r"\d+", scan.stem)
     folders = [scan.parent, *(f for f in sorted(scan.parent.parent.iterdir()) if f.is_dir() and _COLOUR.search(f.name))]
     for folder in folders:

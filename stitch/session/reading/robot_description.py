@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,15 @@ def robot_from_dh(
     gravity: Array,
     length_unit: str,
 ) -> Robot:
-    """Return a robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
+    """Return a robot from Denavit–Hartenberg rows.
+
+    Args:
+        name: of the robot.
+        convention: standard | modified.
+        joints: one row a joint with keys a, alpha_deg, d, theta_deg, mass, com; missing ones are 0.
+        payload: table with mass, kg, and com, flange frame; None: no payload.
+        gravity: (3,) m/s², base frame.
+        length_unit: of a, d and com: a key of METRES.
 
     Raises:
         InputError: unknown convention or key, no row, or a value that is not a finite number.
@@ -45,6 +53,7 @@ def robot_from_dh(
         require_known_keys(where, row, _DH_KEYS)
 
     def column(key: str) -> Array:
+        """Return the numbers (n,) that the rows state under a key."""
         return np.array([float(table_numbers(where, row, key, ())) for where, row in rows])
 
     a = column("a")
@@ -73,7 +82,12 @@ def robot_from_dh(
 
 
 def _joint_transforms(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
-    """Return (n, 4, 4) each: what stands before and behind the turn of every joint."""
+    """Return the constant transforms (n, 4, 4) before and after the rotation of each joint: before · Rz(q) · after.
+
+    Args:
+        convention: standard | modified.
+        a, alpha, d: (n,) length_unit, rad, length_unit.
+    """
     if convention == "standard":
         return np.broadcast_to(np.eye(4), (len(a), 4, 4)), elementary("z", 0, d) @ elementary("x", alpha, a)
     if convention == "modified":
@@ -90,7 +104,7 @@ def _payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
 
 
 def _point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
-    """Return mass (kg, not negative) and com (3,) of a table; 0 where absent."""
+    """Return mass, kg, not negative, and centre of mass `com` (3,), length_unit, of a table; 0 where absent."""
     mass = float(table_numbers(where, table, "mass", ()))
     if mass < 0:
         raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
@@ -98,7 +112,14 @@ def _point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
 
 
 def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
-    """Refuse other keys: a misspelt alpha_deg would silently count as 0, and the arm be another one."""
+    """Refuse a table with a key that is not known: a misspelt alpha_deg would silently count as 0.
+
+    Args:
+        where: names the table in the message.
+
+    Raises:
+        InputError: names the key, and the known one that is most like it.
+    """
     if not isinstance(table, dict):
         raise InputError(
             f"{where}: {shortened(table)} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}"
@@ -130,10 +151,15 @@ def robot_from_urdf(
     gravity: Array,
     payload: dict[str, Any] | None = None,
 ) -> Robot:
-    """Return the serial chain base_link → flange_link, in length_unit.
+    """Return the serial chain from base_link to flange_link of a URDF as a robot, in length_unit.
 
-    Fixed joints are merged. A link's mass includes all links fixed to it, a tool beyond the flange too:
-    `payload` comes on top. Links on moving side branches (fingers) are not counted.
+    Fixed joints are merged. A link's mass includes all links fixed to it, also a tool beyond the flange; `payload` is
+    added to that. Links on moving side branches (fingers) are not counted.
+
+    Args:
+        base_link, flange_link: names of links; None is refused, with the names that could be meant.
+        gravity: (3,) m/s², base frame.
+        payload: table with mass, kg, and com, length_unit in the flange frame; None: no payload.
 
     Raises:
         InputError: unreadable, no such link, no chain between them, or a joint that does not turn freely.
@@ -146,37 +172,53 @@ def robot_from_urdf(
         raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
         scale = 1 / METRES[length_unit]
-        chain = _joint_chain(robot, base_link, flange_link)
-        before, after, mass, com, T_last_flange = _serial_chain(robot, chain, scale)
+        joints = _joint_chain(robot, base_link, flange_link)
+        chain = _serial_chain(robot, joints, scale)
         payload_mass, payload_com = _payload_of(payload)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return Robot(
         name=str(robot.get("name", path.stem)),
         convention="urdf",
-        before=before,
-        after=after,
-        theta=np.zeros(len(before)),
-        mass=mass,
-        com=com,
+        before=chain.before,
+        after=chain.after,
+        theta=np.zeros(len(chain.before)),
+        mass=chain.mass,
+        com=chain.com,
         payload_mass=payload_mass,
         payload_com=payload_com,
         gravity=table_numbers("robot", {"gravity": gravity}, "gravity", (3,)),
         metres_per_unit=METRES[length_unit],
-        meshes=_link_meshes(robot, chain, path.parent, scale, frames.inverse(T_last_flange)),
+        meshes=_link_meshes(robot, joints, path.parent, scale, frames.inverse(chain.T_last_flange)),
     )
 
 
-def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what stands before and behind the turn of every joint (n, 4, 4), and what it moves: mass (n,), com (n, 3).
+class _SerialChain(NamedTuple):
+    """n revolute joints of a URDF: T_base_flange = Π before[i] · Rz(q_i) · after[i]."""
 
-    And T_last_flange (4, 4): the flange's frame in that of the last link.
+    before: Array  # (n, 4, 4), length_unit
+    after: Array  # (n, 4, 4), length_unit
+    mass: Array  # (n,) kg of the link that joint i moves, with all that is fixed to it
+    com: Array  # (n, 3) its centre of mass in the frame behind after[i]: the link's own, of the last one the flange's
+    T_last_flange: Array  # (4, 4) maps the flange to the last link's frame of the URDF
+
+
+def _serial_chain(root: Element, chain: list[Element], scale: float) -> _SerialChain:
+    """Return the revolute joints of a chain, fixed joints merged into their transforms.
+
+    Args:
+        root: of the document, in which the links' masses are looked up.
+        chain: joints from base to flange, fixed ones among them.
+        scale: length_unit per metre.
+
+    Raises:
+        InputError: no revolute joint, or a joint of another kind.
     """
     before: list[Array] = []
     after: list[Array] = []
     mass: list[float] = []
     com: list[Array] = []
-    pending = np.eye(4)
+    pending = np.eye(4)  # product of the transforms since the last revolute joint
     for joint in chain:
         pending = pending @ _origin(joint, scale)
         if joint.get("type") == "fixed":
@@ -191,14 +233,20 @@ def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Ar
         pending = np.eye(4)
     if not before:
         raise InputError("no revolute joint between base_link and flange_link; to fix: name the ends of the arm")
-    # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
+    # Fixed joints behind the last revolute one lead to the flange: `after` ends there, `com` is given in its frame.
     after[-1] = after[-1] @ pending
     com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
-    return np.array(before), np.array(after), np.array(mass), np.array(com), pending
+    return _SerialChain(np.array(before), np.array(after), np.array(mass), np.array(com), pending)
 
 
 def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
-    """Return the joints from base to flange; walked backwards, because a link has one parent."""
+    """Return the joints from base to flange, in this order, fixed ones among them.
+
+    The tree is walked from the flange, because a link has one parent and many children.
+
+    Raises:
+        InputError: a link is not named, there is no chain between them, or a link has two parents.
+    """
     parent_of: dict[str, Element] = {}
     for joint in root.findall("joint"):
         child = _link_name(joint, "child")
@@ -224,7 +272,11 @@ def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) 
 
 
 def _require_turning(joint: Element) -> None:
-    """Refuse a joint that does not turn, or that follows another."""
+    """Refuse a joint that is not revolute, or that copies another joint.
+
+    Raises:
+        InputError: names the joint and its kind.
+    """
     name, kind = joint.get("name"), joint.get("type")
     if kind not in ("revolute", "continuous"):
         raise InputError(f"joint {name} is {kind}; only revolute and continuous joints are known")
@@ -233,7 +285,14 @@ def _require_turning(joint: Element) -> None:
 
 
 def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
-    """Yield mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
+    """Yield mass, kg, and centre of mass (3,), in the frame of `link`, of that link and of every link fixed to it.
+
+    Args:
+        scale: length_unit per metre; centres are in length_unit.
+
+    Raises:
+        InputError: a mass that is negative or no number.
+    """
     for element, T in _fixed_links(root, link, scale):
         name, inertial = element.get("name"), element.find("inertial")
         if inertial is not None and inertial.find("mass") is not None:
@@ -244,7 +303,11 @@ def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float,
 
 
 def _turn_to_z(joint: Element) -> Array:
-    """Return a rotation whose z axis is the joint's axis; URDF's default axis is x."""
+    """Return a rotation (4, 4) whose z axis is the axis of a joint, in the joint's frame; URDF's default axis is x.
+
+    Raises:
+        InputError: the axis is zero or no number.
+    """
     direction = _attribute_numbers(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
     length = np.linalg.norm(direction)
     if length < 1e-9:
@@ -257,7 +320,10 @@ def _turn_to_z(joint: Element) -> Array:
 
 
 def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str, str]]:
-    """Return name and kind of each joint that moves between two links of a URDF's text; none without a chain."""
+    """Return (name, kind) of each moving joint between two links of a URDF's text, from the base on.
+
+    Empty where the text cannot be read or has no chain between them.
+    """
     try:
         chain = _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link)
     except (ValueError, LookupError, ElementTree.ParseError, InputError):
@@ -266,7 +332,12 @@ def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str
 
 
 def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) -> Array:
-    """Return T_base_flange (V, 4, 4), mm, for joints (V, n), rad or m, that turn or slide along their axes."""
+    """Return T_base_flange (V, 4, 4), mm, of a URDF's text at V sets of joint values.
+
+    Args:
+        base_link, flange_link: names of the links at the ends of the chain.
+        joints: (V, n) of the moving joints from the base on: rad, of prismatic ones m.
+    """
     T = np.tile(np.eye(4), (len(joints), 1, 1))
     values = iter(joints.T)
     for joint in _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link):
@@ -307,7 +378,14 @@ def _link_meshes(
 
 
 def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Array] | None:
-    """Return where a visual stands on its link (4, 4), its file and scale (3,); None without a mesh."""
+    """Return T_link_mesh (4, 4) of a <visual>, its file, and its scale (3,), length_unit per unit of the file.
+
+    None where it has no mesh, no file or no numbers.
+
+    Args:
+        folder: of the URDF.
+        scale: length_unit per metre.
+    """
     mesh = visual.find("geometry/mesh")
     file = None if mesh is None else _file(mesh.get("filename") or "", folder)
     if file is None:
@@ -319,7 +397,11 @@ def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Arr
 
 
 def _file(name: str, folder: Path) -> Path | None:
-    """Return the file that a URDF names: beside it, or package://name/rest in a folder above it."""
+    """Return the existing file that a URDF names; None if there is none.
+
+    Plain paths and file:// begin at `folder`, the URDF's. Of package://NAME/REST, NAME/REST or REST is looked for in
+    that folder and in all above it.
+    """
     kind, mark, rest = name.rpartition("://")
     if not rest or (mark and kind not in ("file", "package")):
         return None
@@ -334,7 +416,12 @@ def _file(name: str, folder: Path) -> Path | None:
 
 
 def _fixed_links(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
-    """Yield a link and every link fixed to it, and where each stands in the frame of the first (4, 4)."""
+    """Yield (link, T) for a link and every link fixed to it: T (4, 4) maps its frame to that of the first.
+
+    Args:
+        link: name of the first.
+        scale: length_unit per metre.
+    """
     waiting = [(link, np.eye(4))]
     while waiting:
         name, T = waiting.pop()
@@ -359,7 +446,11 @@ def _link_name(joint: Element, kind: str) -> str:
 
 
 def _origin(owner: Element, scale: float, where: str = "") -> Array:
-    """Return (4, 4) of the <origin> of an element, lengths times `scale`; unity where it has none.
+    """Return the transform (4, 4) of the <origin> of an element; the identity where it has none.
+
+    Args:
+        scale: factor on its lengths: length_unit per metre.
+        where: names the element in a message; empty: as a joint.
 
     Raises:
         InputError: something that is no number.
@@ -374,7 +465,7 @@ def _origin(owner: Element, scale: float, where: str = "") -> Array:
 
 
 def _attribute_numbers(element: Element | None, key: str, default: str, where: str) -> Array:
-    """Return (n,) the numbers of an attribute, as many as its default has.
+    """Return the numbers (n,) of an attribute, as many as the text `default` has, which counts where it is absent.
 
     Raises:
         InputError: other than so many finite numbers.

@@ -34,10 +34,13 @@ _LISTED_CLOUDS = 4
 
 
 def check_scale(session: SessionData, cloud_unit: str) -> None:
-    """Refuse clouds or poses whose size only makes sense in the other unit.
+    """Refuse a session whose clouds, targets or poses are of a size that only makes sense in another unit.
+
+    Args:
+        cloud_unit: of the files of clouds, for messages; the clouds themselves are in length_unit.
 
     Raises:
-        InputError: names the quantity, its size and the key to change.
+        ScaleError: names the quantity, its size and the key to change.
     """
     metres = METRES[session.length_unit]
     toml = session.path / "session.toml"
@@ -63,10 +66,14 @@ def check_scale(session: SessionData, cloud_unit: str) -> None:
 
 
 def require_near(where: str, points: Array) -> None:
-    """Refuse single points (N, 3), m, that no sensor measures: one of them would stretch every grid over the cloud.
+    """Refuse points farther from the scanner than any sensor measures: one would stretch every grid over the cloud.
+
+    Args:
+        where: file or scan, for the message.
+        points: (N, 3) m, scanner frame.
 
     Raises:
-        InputError: how many, and the first of them.
+        InputError: how many, and the number of the first, from 1.
     """
     if np.abs(points).max() > _FARTHEST_M:
         far = np.abs(points).max(axis=1) > _FARTHEST_M
@@ -77,11 +84,17 @@ def require_near(where: str, points: Array) -> None:
 
 
 def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, does: str, cloud_unit: str) -> None:
-    """Refuse a few clouds whose size only makes sense in another unit than that of the others.
+    """Refuse a few clouds whose size only makes sense in another unit, where most others have a plausible one.
 
     Args:
-        sizes: by view, m.
-        does: what a cloud does over that size, with {} in its place.
+        toml: session.toml, for the message.
+        sizes: view -> size of its cloud, m.
+        limits: lowest and highest plausible size, m.
+        does: words for the message with {} for the size, as "extend over {}".
+        cloud_unit: of the files.
+
+    Raises:
+        ScaleError: names these views.
     """
     odd = {name: size for name, size in sizes.items() if not _is_plausible(size, limits)}
     others = [size for name, size in sizes.items() if name not in odd]
@@ -100,7 +113,17 @@ def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, do
 
 
 def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key: str, unit: str) -> None:
-    """Refuse a size, m, beyond its limits; `does` has {} in the place of the size."""
+    """Refuse a size that is not plausible.
+
+    Args:
+        size_m: m.
+        limits: lowest and highest plausible size, m.
+        what, does: subject and predicate of the message, the latter with {} for the size, as "extend over {}".
+        key, unit: the key of session.toml that may be wrong, and what it says now.
+
+    Raises:
+        ScaleError: with the other unit as the fix.
+    """
     if not _is_plausible(size_m, limits):
         hint = f'the scale looks off by 1000: set {key} = "{_OTHER_UNIT[unit]}"'
         raise ScaleError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
@@ -116,15 +139,16 @@ def _length_text(size_m: float) -> str:
 
 
 def _compare_motions(session: SessionData, flange: Array) -> None:
-    """Refuse labelled points that move much more or less than the arm does, so that the unit of one looks wrong.
+    """Refuse a session of labelled points that move much more or less than the arm: the unit of one looks wrong.
 
-    They have no size of their own, but a target that several views see moves with the arm.
+    Single points have no size, but a target that several views see moves about as far as the arm. Passed over where
+    there are clouds, or fewer than three views with points.
 
     Args:
-        flange: (V, 3) positions of the flange, m.
+        flange: (V, 3) positions of the flange, base frame, m.
 
     Raises:
-        ScaleError: they do.
+        ScaleError: names both motions.
     """
     sightings = [view.sighting for view in session.views if view.sighting is not None]
     if len(sightings) < 3 or session.has_clouds:
@@ -143,10 +167,10 @@ def _compare_motions(session: SessionData, flange: Array) -> None:
 
 
 def _compare_standoff(session: SessionData, cloud_unit: str) -> None:
-    """Refuse scans whose size or distance contradicts the working distance that session.toml states.
+    """Refuse scans whose size or distance contradicts the working distance that session.toml states, if it does.
 
     Raises:
-        ScaleError: they do: one of the two looks off by a factor of 1000.
+        ScaleError: one of the two looks off by a factor of 1000.
     """
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     standoff = session.scanner.standoff

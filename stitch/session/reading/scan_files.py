@@ -31,7 +31,11 @@ _DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ 
 
 
 def read_ply(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of the vertices of a PLY by name, as stored."""
+    """Return the columns of the vertices of a PLY, property -> (N,), in the types of the file.
+
+    Raises:
+        InputError: no PLY, or a header that announces more than the file has.
+    """
     require_room(path)
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
@@ -40,10 +44,10 @@ def read_ply(path: Path) -> dict[str, Array]:
 
 
 def require_room(path: Path) -> None:
-    """Refuse a PLY whose header announces more elements than the file has bytes, before room is made for them.
+    """Refuse a PLY whose header announces more elements than the file has bytes, before memory is allocated for them.
 
     Raises:
-        InputError: no such file, or the header promises too much.
+        InputError: no such file, or names the announced number.
     """
     require_file(path, "name a PLY file")
     size = path.stat().st_size
@@ -56,7 +60,10 @@ def require_room(path: Path) -> None:
 
 
 def grid_shape(path: Path) -> tuple[int, int] | None:
-    """Return rows and columns of pixels of a PCD, and of a PLY that says num_rows as range scanners do; else None."""
+    """Return (rows, columns) of a PCD or PLY that is stored pixel by pixel; None of any other.
+
+    A PCD has a HEIGHT above 1; a PLY of a range scanner states num_rows and num_cols as obj_info.
+    """
     with path.open("rb") as stream:
         head = stream.read(_HEADER_BYTES)
     size: dict[bytes, int] = {}
@@ -69,7 +76,7 @@ def grid_shape(path: Path) -> tuple[int, int] | None:
 
 
 def measured_pixels(columns: dict[str, Array]) -> dict[str, Array]:
-    """Return the columns (N,) without pixels of which x, y and z are NaN."""
+    """Return columns (N,) without the pixels whose x, y and z are all NaN; without x, y, z as they are."""
     if not all(axis in columns for axis in "xyz"):
         return columns
     empty = np.isnan(np.asarray([columns[axis] for axis in "xyz"], float)).all(axis=0)
@@ -77,9 +84,10 @@ def measured_pixels(columns: dict[str, Array]) -> dict[str, Array]:
 
 
 def read_text_columns(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of a text, by comma, semicolon, space or tab; a header line names them, else x y z …
+    """Return the columns of a text, name -> (N,); cells are separated by comma, semicolon, blanks or tabs.
 
-    The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
+    A header line names the columns; it may be a comment, if it is the last line before the numbers and names x, y and
+    z. Without one they are x, y, z, scalar_0 …. Decimal commas are understood where no comma separates cells.
     """
     text = path.read_text(encoding="utf-8-sig")
     filled = [line for line in text.splitlines() if line.strip()]
@@ -97,6 +105,7 @@ def read_text_columns(path: Path) -> dict[str, Array]:
     separator = next((s for s in ",;" if s in lines[0]), None)
     first = _column_names(lines[0], separator)
     header = any(not is_number(cell) for cell in first)
+    # Comments before the first line, but for a count of points.
     above = [line for line in filled[: filled.index(lines[0])] if not line.strip().isdigit()]
     names = first if header or not above else _column_names(above[-1].lstrip(" #/"), separator)
     if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
@@ -112,7 +121,17 @@ _SURFACES, _POINTS = ("Part", "Surface"), "SurfacePointCloud"
 
 
 def _columns_of_gocator(path: Path, lines: list[str]) -> dict[str, Array]:
-    """Return x, y, z (N,) of a surface: heights over x in the header and y in each row, or points side by side."""
+    """Return x, y, z (N,) of the first surface in a CSV of Gocator, empty pixels left out.
+
+    A point cloud has x, y, z of each pixel side by side. A surface has heights z: x is in the header above the column,
+    y in the row's own cell.
+
+    Args:
+        lines: of the file, comments and empty ones left out.
+
+    Raises:
+        InputError: no surface in it.
+    """
     begins = [i for i, line in enumerate(lines) if line.strip(" ,\r") in (*_SURFACES, _POINTS)]
     if not begins:
         raise InputError(f"{path}: holds no surface; export the surface, not its profiles")
@@ -137,7 +156,13 @@ def _column_names(line: str, separator: str | None) -> list[str]:
 
 
 def read_mesh(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of the vertices, each once, with the mean normal of the faces around them, if any."""
+    """Return columns x, y, z (N,) of the vertices of a mesh, equal ones merged, and nx, ny, nz if it has faces.
+
+    A normal is the mean of the faces around a vertex. All pieces of a scene are joined.
+
+    Raises:
+        InputError: no vertices.
+    """
     import trimesh
 
     scene = trimesh.load_scene(str(path))
@@ -157,7 +182,13 @@ def read_mesh(path: Path) -> dict[str, Array]:
 
 
 def read_array(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of a .npy: (N, 3) or more, an image (H, W, 3) with NaN in empty pixels, or depths (H, W)."""
+    """Return the columns of a .npy, name -> (N,): x, y, z and scalar_0 … of further columns.
+
+    The array is (N, 3 or more), an image (H, W, 3 or more) with NaN in empty pixels, or a depth image (H, W).
+
+    Raises:
+        InputError: another shape or type.
+    """
     if is_depth_image(path):
         return read_depth_columns(path)
     # Mapped, so that a header that announces more than the file has is refused before room is made.
@@ -187,9 +218,12 @@ def read_left_handed(path: Path) -> dict[str, Array]:
 
 
 def read_ptx(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of Leica's PTX.
+    """Return columns x, y, z, intensity (N,) of Leica's PTX, scanner frame; 0 0 0 where nothing was measured.
 
-    The file has columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured.
+    A scan begins with `_PTX_HEADER` lines: counts of columns and rows, and the scanner's pose.
+
+    Raises:
+        InputError: several scans, or fewer points than announced.
     """
     scans = ptx_scans(path)
     if len(scans) != 1:
@@ -202,7 +236,10 @@ def read_ptx(path: Path) -> dict[str, Array]:
 
 
 def ptx_scans(path: Path) -> list[list[str]]:
-    """Return the lines of each scan of a PTX file; columns and rows in the first two tell how many."""
+    """Return the lines of each scan of a PTX file, header included.
+
+    Its first two lines, columns and rows, say how many points follow the header.
+    """
     lines = [line for line in path.read_text(encoding="ascii", errors="replace").splitlines() if line.strip()]
     scans = []
     while lines:
@@ -223,7 +260,11 @@ def read_las(path: Path) -> dict[str, Array]:
 
 
 def read_e57(path: Path) -> dict[str, Array]:
-    """Return columns (N,) of the one scan of an E57 in its own frame, by pye57."""
+    """Return columns x, y, z, and intensity if there is one, (N,), of the only scan of an E57, scanner frame, m.
+
+    Raises:
+        InputError: several scans, or pye57 is not installed.
+    """
     announced_points.require_e57_room(path)
     file = import_extra("pye57", path, "formats").E57(str(path))
     if file.scan_count != 1:

@@ -23,7 +23,10 @@ _PTX_MATRIX = slice(6, 10)
 
 
 def poses_in_scans(files: list[Path]) -> Array | None:
-    """Return poses (N, 4, 4) of scans of one format in the files' unit; None where one has none, or all are the same.
+    """Return the poses (N, 4, 4) in the headers of N scans of one format, lengths in the files' unit.
+
+    They map scanner coordinates to the frame of the software that wrote them. None for files of several formats or
+    another one, where a file has no pose that is a rigid motion, and where all poses are the same.
 
     Raises:
         InputError: the package that reads such files is not installed.
@@ -56,7 +59,10 @@ def _e57(file: Path) -> Array | None:
 
 
 def _ptx(file: Path) -> Array:
-    """Return (4, 4) of the four lines of a matrix for rows of points: the translation stands in the last of them."""
+    """Return the pose (4, 4) of a PTX, in its unit.
+
+    The file holds the transposed matrix, for row vectors: the translation is its last line.
+    """
     with file.open(encoding="ascii", errors="replace") as stream:
         lines = [line.split() for _, line in zip(range(_PTX_MATRIX.stop), stream, strict=False)]
     T = np.array(lines[_PTX_MATRIX], float).T
@@ -76,7 +82,9 @@ def _pcd(file: Path) -> Array | None:
 
 
 def times_in_scans(files: list[Path]) -> list[str] | None:
-    """Return when each scan began, as 2026-12-31T23:59:59.250000, of E57; None where one does not say it.
+    """Return the time at which each scan began, as 2026-12-31T23:59:59.250000, from the headers of E57 files.
+
+    None for other formats, and where one of the files states no time.
 
     Raises:
         InputError: the package that reads such files is not installed.
@@ -90,7 +98,7 @@ def times_in_scans(files: list[Path]) -> list[str] | None:
 
 
 def _e57_seconds(file: Path) -> float:
-    """Return seconds since _GPS_EPOCH; zero where the header has no time."""
+    """Return the time of the first scan of an E57, s since `_GPS_EPOCH`; 0 where the header has none."""
     require_e57_room(file)
     opened = import_extra("pye57", file, "formats").E57(str(file))
     try:

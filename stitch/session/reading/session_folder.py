@@ -59,11 +59,12 @@ def load_session(
     """Return the session of a folder, checked; lengths in its length_unit.
 
     Args:
-        only: name of the one view that is read; None: all.
+        path: the folder.
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
+        start: (n,) joint angles, rad, of a single view that stands in for views.csv, which is not read then.
         at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
-        memory: bytes within which a run of the session has to stay; may be less than `at_most` asks for.
-        start: (n,) rad: joint angles of the only view, where nobody has planned any and there is no views.csv.
+        memory: bytes for a run of the session; may allow fewer points than `at_most`; None: not limited.
+        only: name of the single view that is read; None: all.
 
     Raises:
         InputError: anything missing, contradictory or implausible; names file, line or view, and how to fix it.
@@ -81,7 +82,7 @@ def load_session(
     rows = [row for row in rows if only is None or row.view.name == only]
     cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
-    # A scan that is moved point by point cannot be read once more from its file.
+    # Scans of a moving scanner are corrected point by point: the file does not hold what would be read again.
     at_most = None if scanner.moving else at_most
     if memory is not None:
         at_most = min(at_most or MAX_POINTS, points_within(memory, len(rows)))
@@ -118,7 +119,14 @@ def load_session(
 
 
 def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:
-    """Return what views show of targets by view, from points.csv or frames.csv."""
+    """Return view -> its labelled points from points.csv, or its probe or board from frames.csv; empty without either.
+
+    Args:
+        known: names of the views of views.csv.
+
+    Raises:
+        InputError: both tables are there, or one cannot be read.
+    """
     points = path / "points.csv"
     frames = path / "frames.csv"
     for optional in (points, frames, path / "targets.csv"):
@@ -132,7 +140,16 @@ def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:
 
 
 def _with_seen(path: Path, row: ViewRow, cloud: Cloud | None, sightings: Mapping[str, Sighting]) -> View:
-    """Return the view of a row with what it saw; `sightings` are those of all views."""
+    """Return the view of a row with its cloud and its labelled points.
+
+    Args:
+        path: the session's folder, for the message.
+        cloud: its scan; None: it has none.
+        sightings: view -> labelled points, of all views.
+
+    Raises:
+        InputError: no cloud, in a session without labelled points.
+    """
     if cloud is None and not sightings:
         raise InputError(
             f"{path / 'views.csv'} line {row.line}: view {row.view.name} names no cloud; fill the column "
@@ -142,7 +159,11 @@ def _with_seen(path: Path, row: ViewRow, cloud: Cloud | None, sightings: Mapping
 
 
 def _read_nominal(path: Path, views: Sequence[View]) -> NominalTargets | None:
-    """Return where targets.csv puts the targets; None without it."""
+    """Return the nominal positions of targets.csv, part frame; None without that file.
+
+    Raises:
+        InputError: no points.csv beside it, or no target in common.
+    """
     file = path / "targets.csv"
     if not file.is_file():
         return None
@@ -162,10 +183,12 @@ def read_scans(
     within: Array | None,
     at_most: int | None,
 ) -> Iterator[Cloud | None]:
-    """Read the scans of a session folder on all cores, in the order of its rows; None where a row names none.
+    """Yield the scans of a session folder, in the order of its rows; None where a row names none. Read on all cores.
 
     Args:
-        cloud_unit: of the files; the clouds come in length_unit.
+        path: the folder; the rows' files are relative to it.
+        length_unit: of the clouds that are returned.
+        cloud_unit: of the files.
         within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit; None: all counts.
         at_most: points of a view that stay in memory; None: all.
 
@@ -193,7 +216,15 @@ def read_scans(
 
 
 def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:
-    """Return what counts of a scan, its numbers times `scale`."""
+    """Return the points of a scan file inside a box, lengths times `scale`.
+
+    Args:
+        scale: length_unit per unit of the file.
+        within: (2, 3) lowest and highest corner, scanner frame, length_unit; None: all points.
+
+    Raises:
+        InputError: no point is inside.
+    """
     cloud = read_cloud(file, scale)
     if within is None:
         return cloud
@@ -210,12 +241,12 @@ def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:
 def checked_scan(
     name: str, where: str, read: Callable[[], Cloud], *, metres: float, scanner: Scanner, at_most: int | None
 ) -> Cloud:
-    """Read one scan, check it, and keep so many of its points in memory.
+    """Return one scan, read and checked, with at most `at_most` of its points in memory; repeated points left out.
 
     Args:
         name: of the view.
         where: file, or name of the scan, for messages.
-        read: gives the whole scan in length_unit, and once more when it is fused.
+        read: returns the whole scan in length_unit; it is called again when the scan is fused.
         metres: in one length_unit.
         at_most: points that stay in memory; None: all.
 
@@ -237,9 +268,9 @@ def checked_scan(
 
 
 def session_hash(session: SessionData) -> str:
-    """Return SHA-256 over the session's tables and the clouds that they name, in this order; first 16 digits.
+    """Return the first 16 digits of SHA-256 over the session's tables and the clouds that they name, in this order.
 
-    A dash where the session does not lie on disk any more.
+    A dash where the session is not on disk any more. Of a joined session those of its parts, with + between them.
     """
     if session.parts:
         return "+".join(map(session_hash, session.parts))
@@ -263,9 +294,9 @@ def measured_files(folder: Path) -> list[Path]:
 
 
 def content_hash(folder: Path, files: Sequence[Path]) -> str:
-    """Return SHA-256 over names and contents of files below a folder, in this order; first 16 digits.
+    """Return the first 16 digits of SHA-256 over names and contents of files, in this order.
 
-    A dash where one cannot be read, or lies elsewhere.
+    A dash where one cannot be read, or is not inside the folder.
     """
     digest = hashlib.sha256()
     try:

@@ -74,17 +74,26 @@ def read_session_document(file: Path) -> dict[str, Any]:
 
 
 def usual_guesses(file: Path, document: dict[str, Any]) -> dict[str, str]:
-    """Return what `stitch init` took because it is usual and nothing shows it: comments with "?", as long as they hold.
+    """Return key -> value of what `stitch init` guessed, since nothing in the data shows it.
+
+    It writes such values as comments "# ? KEY: VALUE". A key to which the document now gives another value is no guess.
 
     Args:
-        document: of the file; what it states otherwise by now is no guess.
+        file: session.toml.
+        document: its content.
     """
     found = re.findall(r"^# \? (\w+): ([^;,\n]+)", file.read_text(encoding="utf-8"), re.MULTILINE)
     return {what: value for what, value in found if document.get(what, value) == value}
 
 
 def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = ()) -> None:
-    """Refuse a table of session.toml with keys that nobody knows, or that do not count where it comes from.
+    """Refuse a table as of session.toml that has unknown keys.
+
+    Args:
+        file: for messages.
+        name: of the table, a key of `_KEYS`.
+        table: its content.
+        without: keys that are known in session.toml, and refused here.
 
     Raises:
         InputError: no table, or such a key.
@@ -93,7 +102,16 @@ def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = 
 
 
 def _require_entries(file: Path, table: str, entries: Any, known: Collection[str]) -> None:
-    """Refuse what is no table, or one with a key that is not known; name the known key that is most like it."""
+    """Refuse what is no table, or one with an unknown key.
+
+    Args:
+        table: its name; empty: the document itself.
+        entries: its content.
+        known: keys.
+
+    Raises:
+        InputError: names the key, and the known one that is most like it.
+    """
     if not isinstance(entries, dict):
         raise InputError(f"{file}: [{table}] must be a table")
     for key in map(str, entries):
@@ -116,7 +134,7 @@ def session_name(file: Path, document: dict[str, Any]) -> str:
 
 
 def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
-    """Return the scanner of [scanner]: where it sits and what it is; lengths in length_unit.
+    """Return the scanner that the table [scanner] describes; lengths in length_unit. Missing keys have their defaults.
 
     Raises:
         InputError: a value that cannot be, and how to fix it.
@@ -141,7 +159,11 @@ def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
 
 
 def _read_pose(file: Path, value: Any) -> Array:
-    """Return a pose (4, 4) whose rotation is exact; refuse what is no rigid motion."""
+    """Return scanner.pose as a rigid motion (4, 4), its rotation made exactly orthonormal.
+
+    Raises:
+        InputError: no 4×4 matrix, or one that is no rigid motion within 1e-3.
+    """
     try:
         T = np.array(value, float)
     except (TypeError, ValueError, OverflowError):
@@ -182,7 +204,15 @@ def read_axes(file: Path, tables: Any, mount: str, has_poses: bool) -> tuple[Axi
 
 
 def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
-    """Return one axis; `mount` is empty without a robot."""
+    """Return one axis of [[axis]], in the frame in which the table states it.
+
+    Args:
+        where: names the table until its own name is known.
+        mount: eye_to_hand | eye_in_hand; "" without a robot. It says what an axis may carry.
+
+    Raises:
+        InputError: a value that cannot be, and how to fix it.
+    """
     require_known_keys(f"{file}: {where}", table, _AXIS_KEYS)
     name = table.get("name")
     if not isinstance(name, str) or not _AXIS_NAME.fullmatch(name):
@@ -210,7 +240,7 @@ def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
 
 
 def _one_of(where: str, table: dict[str, Any], key: str, choices: Collection[str]) -> str:
-    """Return the value of a key that has to be one of some choices.
+    """Return the value at `key` of a table, which has to be one of some words.
 
     Raises:
         InputError: it is none of them.
@@ -223,9 +253,9 @@ def _one_of(where: str, table: dict[str, Any], key: str, choices: Collection[str
 
 
 def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:
-    """Return [scanner] within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit.
+    """Return scanner.within: lowest and highest corner (2, 3) of a box, scanner frame, length_unit; None without one.
 
-    None where all counts.
+    Points outside it are left out of the scans.
 
     Raises:
         InputError: not two corners, or the second one not above the first.
@@ -291,7 +321,7 @@ def read_repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeat
 
 
 def cad_file(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
-    """Return path and unit of the CAD file of [part]; None where they are absent.
+    """Return path and length unit of the CAD file of [part]; None for what is not stated.
 
     Raises:
         InputError: no such file, or another unit.

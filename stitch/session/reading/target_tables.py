@@ -19,10 +19,11 @@ _PROBE = "probe"
 
 
 def read_points(file: Path, known: Collection[str]) -> dict[str, Sighting]:
-    """Read and check points.csv: the sighting of every view that has one.
+    """Return view -> its labelled points, sensor frame, from points.csv; sigma NaN where none is stated.
 
     Args:
-        known: views of views.csv.
+        file: points.csv.
+        known: names of the views of views.csv.
 
     Raises:
         InputError: names the line and how to fix it.
@@ -47,10 +48,11 @@ def read_points(file: Path, known: Collection[str]) -> dict[str, Sighting]:
 
 
 def read_targets(file: Path, sighted: Sequence[str]) -> NominalTargets:
-    """Read and check targets.csv.
+    """Return the nominal positions of targets.csv, part frame; sigma NaN where none is stated.
 
     Args:
-        sighted: targets of points.csv; one of them at least must be here.
+        file: targets.csv.
+        sighted: targets of points.csv; one of them at least must be in the file.
 
     Raises:
         InputError: names the line and how to fix it.
@@ -73,10 +75,11 @@ def read_targets(file: Path, sighted: Sequence[str]) -> NominalTargets:
 
 
 def read_frames(file: Path, known: Collection[str]) -> dict[str, Sighting]:
-    """Read and check frames.csv: the pose of the probe (tracker) or board (camera) in the sensor's frame, by view.
+    """Return view -> the pose of the probe (tracker) or board (camera) in the sensor's frame, from frames.csv.
 
     Args:
-        known: views of views.csv.
+        file: frames.csv.
+        known: names of the views of views.csv.
 
     Raises:
         InputError: names the line and how to fix it.
@@ -105,11 +108,14 @@ def read_frames(file: Path, known: Collection[str]) -> dict[str, Sighting]:
 
 
 def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[tuple[int, dict[str, str]]]:
-    """Return line number and cells by column of every row.
+    """Return for every row of a table its line number and column -> cell, stripped.
 
     Args:
-        needed: columns without which a row says nothing.
-        empty: what to say of a table without rows.
+        needed: columns that the table must have.
+        empty: message for a table without rows.
+
+    Raises:
+        InputError: a column is missing, there is no row, or the file cannot be read.
     """
     header, rows = read_csv_lines(file)
     missing = [name for name in needed if name not in header]
@@ -121,7 +127,11 @@ def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[tuple[int
 
 
 def _target_rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """Return line number and cells by column of every row; each names a target."""
+    """Return for every row of a table its line number and column -> cell; each row must name a target.
+
+    Raises:
+        InputError: as `_table_rows`, or a name is empty or cannot be printed.
+    """
     rows = _table_rows(file, needed, f"{file}: no rows; write {','.join(needed)}[,sigma] a row")
     for line, row in rows:
         if not row["target"]:
@@ -138,7 +148,14 @@ def _require_view(file: Path, line: int, view: str, known: Collection[str]) -> N
 
 
 def _point_numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
-    """Return x, y, z and sigma, NaN where its cell is empty or the column absent."""
+    """Return x, y, z and sigma of a row, length_unit; sigma is NaN where its cell is empty or the column absent.
+
+    Args:
+        row: column -> cell.
+
+    Raises:
+        InputError: no number, or a sigma that is not positive.
+    """
     place = [finite_number(file, line, column, row[column]) for column in _XYZ]
     sigma = finite_number(file, line, "sigma", row["sigma"]) if row.get("sigma") else float("nan")
     if sigma <= 0:
@@ -147,7 +164,11 @@ def _point_numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
 
 
 def _column_sigma(file: Path, line: int, row: dict[str, str], column: str) -> float:
-    """Return a standard deviation of which every row has one; NaN where the column is absent."""
+    """Return the standard deviation in a column of a row; NaN where the table has no such column.
+
+    Raises:
+        InputError: the cell is empty, no number, or not positive.
+    """
     sigma = finite_number(file, line, column, row[column]) if column in row else float("nan")
     if sigma <= 0:
         raise InputError(f"{file} line {line}: {column} is {sigma:g}; write a positive number")

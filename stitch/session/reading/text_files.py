@@ -35,7 +35,11 @@ _RESERVED = "/\\"
 
 
 def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
-    """Return the text of a file, with or without the mark of UTF-8 (BOM) in front.
+    """Return the text of a file in UTF-8, without the byte order mark that may be in front.
+
+    Args:
+        hint: what to do where there is no such file.
+        largest_mb: MB; larger files are refused.
 
     Raises:
         InputError: no such file, too large, or not UTF-8.
@@ -48,9 +52,13 @@ def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
 
 
 def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
-    """Return the text of a file of another program: UTF-8, UTF-16 with its mark, else Windows' Western European.
+    """Return the text of a file of another program, in UTF-8, UTF-16 with its byte order mark, or else Windows-1252.
 
-    Spreadsheets write the last two; of a wrong guess only letters in names suffer, digits are the same in all.
+    Spreadsheets write the last two. A wrong guess changes only letters in names: digits are the same in all.
+
+    Args:
+        hint: what to do where there is no such file.
+        largest_mb: MB; larger files are refused.
 
     Raises:
         InputError: no such file, too large, or no text.
@@ -75,10 +83,10 @@ def _require_size(file: Path, hint: str, largest_mb: float) -> None:
 
 @contextmanager
 def readable(place: Path | None = None) -> Iterator[None]:
-    """Refuse a file or folder whose rights forbid to read it, while the block runs.
+    """Turn a PermissionError in the block into an InputError with one clear line.
 
     Args:
-        place: what is read, where the error itself does not name it.
+        place: what is read, for an error that names no file.
 
     Raises:
         InputError: names it, and how to fix it.
@@ -115,7 +123,10 @@ def require_file(file: Path, hint: str) -> None:
 
 
 def _reason_missing(file: Path) -> str | None:
-    """Return what to say in place of "not found", where the folder tells what it is; None where it does not."""
+    """Return a message for a missing file whose folder shows what was confused; None where "not found" says enough.
+
+    A run's folder was named in place of a session's, or a file of a run is missing.
+    """
     folder = file.parent
     if file.name == _SESSION and _is_run(folder):
         # The session of a run, or those of a rig.
@@ -131,6 +142,7 @@ def _reason_missing(file: Path) -> str | None:
 
 
 def _is_run(folder: Path) -> bool:
+    """Return True if a folder holds a result.json or a model.toml of ours."""
     if _session_of_result(folder / "result.json") is not None:
         return True
     model = folder / "model.toml"
@@ -144,10 +156,10 @@ def _session_of_result(file: Path) -> str | None:
 
 
 def not_utf8(file: Path, save_as: str) -> str:
-    """Return what to say of a file that is not UTF-8: where its first byte stands that is none.
+    """Return the message for a file that is not UTF-8, with the line of its first byte that is none.
 
     Args:
-        save_as: the kind to save it as.
+        save_as: format to save it as, for the message.
     """
     content = file.read_bytes()
     mend = f"to fix: save it as {save_as}"
@@ -205,7 +217,7 @@ def optional_text(file: Path, table: dict[str, Any], name: str, key: str) -> str
 
 
 def read_json_object(file: Path) -> dict[str, Any]:
-    """Return what a JSON file holds; nothing where it is missing, damaged, or no object."""
+    """Return the object in a JSON file; {} where the file is missing, damaged, or holds no object."""
     if not file.is_file():
         return {}
     try:
@@ -216,10 +228,10 @@ def read_json_object(file: Path) -> dict[str, Any]:
 
 
 def workbook_sheets(file: Path) -> dict[str, str]:
-    """Return the sheets of a spreadsheet that hold something as CSV, by their names.
+    """Return sheet name -> its content as CSV, of the sheets of a workbook that are not empty.
 
     Raises:
-        InputError: no such file, no workbook, or a larger one than tables are; the package that reads them is missing.
+        InputError: no such file, no workbook, one that is too large, or the package that reads them is missing.
     """
     require_file(file, "name a workbook")
     require_workbook_room(file)
@@ -239,10 +251,14 @@ def workbook_sheets(file: Path) -> dict[str, str]:
 
 
 def require_name(where: str, name: str, what: str) -> str:
-    """Return an id that can be printed on a line.
+    """Return a name of a view, target or column as it is, if it can be printed on a line.
+
+    Args:
+        where: file and line, for the message.
+        what: it is the name of, for the message.
 
     Raises:
-        InputError: too long, or with characters that nobody sees.
+        InputError: too long, or with characters that cannot be printed.
     """
     if len(name) > _LONGEST:
         raise InputError(
@@ -255,7 +271,11 @@ def require_name(where: str, name: str, what: str) -> str:
 
 
 def require_folder_name(where: str, name: str, what: str) -> str:
-    """Return a name under which a folder can be made: that of a session is one of its run.
+    """Return a name as it is, if a folder can have it: a session's name becomes that of its run's folder.
+
+    Args:
+        where: file, for the message.
+        what: it is the name of, for the message.
 
     Raises:
         InputError: empty, a path, hidden, or longer than a file system allows.
@@ -272,9 +292,9 @@ def require_folder_name(where: str, name: str, what: str) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Return what a library says of bytes that it cannot read, on one line.
+    """Return the message of a library's error at bytes that it cannot read, on one line and shortened.
 
-    A mesh that is no mesh may be text in an encoding for which the library lacks a package: that helps nobody.
+    An ImportError says only that the bytes look like another format, for which a package is missing: it is replaced.
     """
     if isinstance(error, ImportError):
         return "its bytes are not what its name says"

@@ -49,10 +49,16 @@ class ViewRow:
 
 
 def read_views(file: Path, robot: Robot | None, axes: Sequence[Axis] = (), length_unit: str = "mm") -> list[ViewRow]:
-    """Read and check views.csv.
+    """Return the rows of views.csv, checked.
 
-    Columns that hold text in every row (notes) are left alone. Where joints and a reported pose both
-    stand, the reported pose is used and must agree with the joints.
+    Columns that hold text in every row (notes) are passed over. Where a row has joints and a reported pose, the
+    reported pose is used and must agree with the joints.
+
+    Args:
+        file: views.csv.
+        robot: None: its kinematics are not known, so that every row needs a pose.
+        axes: external axes; each needs a column of readings. With axes alone, poses are the identity.
+        length_unit: of positions.
 
     Raises:
         InputError: names the line and how to fix it.
@@ -111,7 +117,7 @@ def has_pose_columns(header: Sequence[str]) -> bool:
 
 
 def _axis_column(file: Path, header: Sequence[str], axis: Axis, length_unit: str) -> str:
-    """Return the column of an axis' readings.
+    """Return the name of the column that holds an axis' readings: NAME_deg, NAME_mm or NAME_m.
 
     Raises:
         InputError: none, or two of them.
@@ -127,10 +133,10 @@ def _axis_column(file: Path, header: Sequence[str], axis: Axis, length_unit: str
 
 
 def row_at(file: Path, robot: Robot | None, joints: Array) -> ViewRow:
-    """Return the row of a view that stands in no table, at joint angles (n,) rad.
+    """Return a row as of views.csv, for a view named "start" at joint angles (n,) rad.
 
     Args:
-        file: session.toml.
+        file: session.toml, for messages.
 
     Raises:
         InputError: no robot, or one with another number of joints.
@@ -146,7 +152,10 @@ def row_at(file: Path, robot: Robot | None, joints: Array) -> ViewRow:
 
 
 def has_reported_poses(file: Path) -> bool:
-    """Return True if some row of a views.csv that was read before reports a pose; False where there is no such file."""
+    """Return True if some row of a views.csv has a pose; False where there is no such file.
+
+    The table must have been checked before: here nothing is.
+    """
     if not file.is_file():
         return False
     header, rows = read_csv_lines(file)
@@ -155,7 +164,10 @@ def has_reported_poses(file: Path) -> bool:
 
 
 def _check_header(file: Path, header: Sequence[str], robot: Robot | None, has_axes: bool = False) -> int:
-    """Return how many joints have a column.
+    """Check the names of the columns of views.csv; return the number of joint columns, 0 without any.
+
+    Args:
+        has_axes: external axes have columns, so that neither poses nor joints are needed.
 
     Raises:
         InputError: neither poses nor joint angles, some of their columns alone, or a column twice.
@@ -179,7 +191,13 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None, has_ax
 
 
 def _require_joint_columns(file: Path, header: Sequence[str], robot: Robot | None) -> int:
-    """Return how many joints have a column, which are all of the robot's or none."""
+    """Return the number of joint columns j1_deg … jN_deg: that of the robot's joints, or 0.
+
+    Without a robot any number without a gap is allowed.
+
+    Raises:
+        InputError: a gap, or another number than the robot has.
+    """
     numbers = sorted(int(match[1]) for name in header if (match := _JOINT.match(name)))
     if not numbers:
         return 0
@@ -199,10 +217,10 @@ def _require_joint_columns(file: Path, header: Sequence[str], robot: Robot | Non
 
 
 def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
-    """Return the columns of numbers that are neither poses nor joints: what errors may follow.
+    """Return the names of the columns that hold a number in some row and are neither poses, joints nor time.
 
     Args:
-        cells: line number and cells by column of every row.
+        cells: of every row its line number and column -> cell.
     """
     return [name for name in header if _may_be_covariate(name) and any(is_number(row[name]) for _, row in cells)]
 
@@ -214,10 +232,13 @@ def _may_be_covariate(column: str) -> bool:
 
 
 def require_covariate_name(where: str, name: str) -> str:
-    """Return the name of a covariate, under which views.csv can hold a column of its own.
+    """Return the name of a covariate as it is, if views.csv can have a column of that name.
+
+    Args:
+        where: for the message.
 
     Raises:
-        InputError: one that is another column's, empty, or not to be read back.
+        InputError: the name of another column, empty, with blanks at its ends, or not printable.
     """
     require_name(where, name, "covariate")
     if not name or name != name.strip() or not _may_be_covariate(name):
@@ -226,7 +247,12 @@ def require_covariate_name(where: str, name: str) -> str:
 
 
 def _row_joints(file: Path, line: int, row: dict[str, str], count: int) -> Array | None:
-    """Return the joint angles (n,) of a row, rad; None where it has none."""
+    """Return the joint angles (count,) of a row, rad; None where all their cells are empty.
+
+    Args:
+        row: column -> cell.
+        count: number of joint columns.
+    """
     names = [f"j{i + 1}_deg" for i in range(count)]
     if not any(row[name] for name in names):
         return None
@@ -236,7 +262,14 @@ def _row_joints(file: Path, line: int, row: dict[str, str], count: int) -> Array
 def _row_approach(
     file: Path, line: int, row: dict[str, str], joints: Array | None, before: Array | None
 ) -> Array | None:
-    """Return how each joint (n,) comes to its place, −1, 0, +1: as stated, else from the row before."""
+    """Return the direction (n,) from which each joint came, −1, 0 or +1; None without joints.
+
+    As the columns jN_approach state it, else the sign of the change since the row before; 0 in the first row.
+
+    Args:
+        row: column -> cell.
+        joints, before: (n,) rad, of this row and of the one before; None: it has none.
+    """
     if joints is None:
         return None
     approach = np.zeros(len(joints)) if before is None else np.sign(joints - before)
@@ -250,11 +283,11 @@ def _row_approach(
 
 
 def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]], joints: int) -> None:
-    """Refuse loads of some views or some joints alone: gravity would silently take their place.
+    """Refuse torques or payloads that only some views or some joints have: gravity would silently stand in for them.
 
     Args:
-        cells: line number and cells by column of every row.
-        joints: how many the table has.
+        cells: of every row its line number and column -> cell.
+        joints: number of joints in the table.
 
     Raises:
         InputError: names the line or the columns, and how to fix it.
@@ -278,14 +311,15 @@ def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, 
 def _flange_pose(
     file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None
 ) -> Array:
-    """Return T_base_flange (4, 4) of a view; a reported pose is used where it stands, and must agree with the joints.
+    """Return T_base_flange (4, 4) of a row, length_unit: the reported pose, else the one computed from the joints.
 
     Args:
-        row: cells by their column.
-        joints: (n,) rad.
+        name: of the view, for messages.
+        row: column -> cell.
+        joints: (n,) rad; None: the row has none.
 
     Raises:
-        InputError: neither stands there, or what stands there is no pose, or not that of the joints.
+        InputError: the row has neither, the pose is none, or it disagrees with the joints.
     """
     from_joints = forward(robot, joints) if robot and joints is not None else None
     given = [row.get(column, "") for column in POSE_COLUMNS]
@@ -310,14 +344,17 @@ def _flange_pose(
 
 
 def require_agreement(where: str, reported: Array, from_joints: Array, metres: float) -> None:
-    """Refuse a reported pose (4, 4) that is not that of the joints.
+    """Refuse a reported pose that differs from the one computed from the joints by more than the tolerances.
+
+    `_ANGLE_TOLERANCE`, and `_REACH_TOLERANCE` of the reach: more is another convention, not an uncalibrated arm.
 
     Args:
         where: row and view, for messages.
-        metres: in one length_unit.
+        reported, from_joints: (4, 4) T_base_flange, length_unit.
+        metres: metres per length_unit.
 
     Raises:
-        InputError: by how much they differ, and what to check.
+        InputError: by how much they differ, in mm and °, and what to check.
     """
     angle, distance, reach = _disagreement(reported, from_joints)
     if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
@@ -330,10 +367,13 @@ def require_agreement(where: str, reported: Array, from_joints: Array, metres: f
 def _require_no_hidden_joints(
     file: Path, cells: Sequence[tuple[int, dict[str, str]]], poses: Sequence[Array], robot: Robot | None
 ) -> None:
-    """Refuse columns whose names and numbers are those of joint angles, but that would count as covariates.
+    """Refuse joint angles in columns of other names, as J1 …, which would silently count as covariates.
+
+    Columns are joint angles if, in degrees or in radians, the robot's kinematics lead from them to the poses.
 
     Args:
-        poses: (4, 4) T_base_flange of every row; columns that do not lead there are covariates, whatever their names.
+        cells: of every row its line number and column -> cell.
+        poses: T_base_flange (4, 4) of every row.
 
     Raises:
         InputError: names the columns, and what to call them.
@@ -353,14 +393,17 @@ def _require_no_hidden_joints(
 
 
 def _otherwise_named_joints(header: Sequence[str]) -> list[str]:
-    """Return columns J1, J2 …, in the order of their numbers; none where one is missing or twice."""
+    """Return the columns named like joints, as J1 or axis_1, in the order of their numbers from 1.
+
+    Empty where a number is missing or repeated.
+    """
     numbers = {name: int(match[1]) for name in header if (match := _OTHER_JOINT_NAME.fullmatch(name))}
     names = sorted(numbers, key=lambda name: numbers[name])
     return names if [numbers[name] for name in names] == [*range(1, len(names) + 1)] else []
 
 
 def _reaches_pose(robot: Robot, joints: Array, T: Array) -> bool:
-    """Return whether joint angles (J,), rad, bring the flange to a pose T (4, 4), within the limits of a table."""
+    """Return True if joint angles (n,) rad lead to T_base_flange T (4, 4), within `require_agreement`'s tolerances."""
     if not np.isfinite(joints).all():
         return False
     from_joints = forward(robot, joints)
@@ -369,7 +412,10 @@ def _reaches_pose(robot: Robot, joints: Array, T: Array) -> bool:
 
 
 def _disagreement(reported: Array, from_joints: Array) -> tuple[float, float, float]:
-    """Return angle (rad) and distance between two flange poses (4, 4), and the reach of the second, length_unit."""
+    """Return angle, rad, and distance, length_unit, between two poses T_base_flange (4, 4), and the second's reach.
+
+    The reach is the flange's distance from the base, length_unit.
+    """
     distance = np.linalg.norm(reported[:3, 3] - from_joints[:3, 3])
     return (
         float(frames.angle_between(reported, from_joints)),

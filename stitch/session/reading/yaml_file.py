@@ -41,7 +41,14 @@ def parse_yaml(file: Path, text: str) -> list[Any]:
 
 
 def _value(file: Path, event: yaml.Event, events: Iterator[yaml.Event], depth: int = 0) -> Any:
-    """The scalar, list or mapping that begins with an event."""
+    """Return the number, text, list or dict that begins with an event of the parser; later events are taken as needed.
+
+    Args:
+        depth: of nesting, which is limited.
+
+    Raises:
+        InputError: an alias, a key that is no word, or too deep nesting.
+    """
     line = f"{file} line {event.start_mark.line + 1}"
     if depth > _DEEPEST:
         raise InputError(f"{line}: nested too deeply; to fix: write plain lists")
