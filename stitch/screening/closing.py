@@ -120,53 +120,65 @@ def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[floa
     starts = Rotation.random(_STARTS, rng=np.random.default_rng(0)).as_matrix()
     X = frames.make(np.tile(starts, (count, 1, 1)), np.zeros(3))
     X[:, :3, 3] = _best_translation(poses, X, centroids, share)
-    cost = np.einsum("pv,pvi->p", share, _centroid_residual(poses, X, centroids, share) ** 2)
+    R, residual = _placed(poses, X, centroids, share)
+    cost = _mean_square(residual, share)
     damping = np.full(len(X), 1e-3)
     for _ in range(_CENTROID_STEPS):
-        step = _centroid_step(poses, X, centroids, share, damping)
-        new = X @ frames.exp(step)
-        new_cost = np.einsum("pv,pvi->p", share, _centroid_residual(poses, new, centroids, share) ** 2)
+        new = X @ frames.exp(_centroid_step(R, residual, centroids, share, damping))
+        new_R, new_residual = _placed(poses, new, centroids, share)
+        new_cost = _mean_square(new_residual, share)
         better = new_cost < cost
-        X = np.where(better[:, None, None], new, X)
-        cost = np.where(better, new_cost, cost)
+        X[better] = new[better]
+        R[better] = new_R[better]
+        residual[better] = new_residual[better]
+        cost[better] = new_cost[better]
         damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-9, 1e6)
     cost = cost.reshape(count, _STARTS)
     best = np.argmin(cost, axis=1)
     return [(float(np.sqrt(cost[i, b])), X[i * _STARTS + b]) for i, b in enumerate(best)]
 
 
-def _centroid_residual(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
-    """Return (P, V, 3) centroids placed by P hand-eyes X, about their mean over the views in use, by their share."""
-    placed = frames.transform(poses @ X[:, None], centroids[None, :, None])[:, :, 0]
-    return placed - np.einsum("pv,pvi->pi", share, placed)[:, None]
+def _placed(poses: Array, X: Array, centroids: Array, share: Array) -> tuple[Array, Array]:
+    """Return rotations (P, V, 3, 3) of the scans placed by P hand-eyes X, and their centroids about the mean by share."""
+    R_mount = poses[..., :3, :3].reshape(len(X), -1, 3)
+    R = (R_mount @ X[:, :3, :3]).reshape(*share.shape, 3, 3)
+    placed = (R @ centroids[..., None])[..., 0] + (R_mount @ X[:, :3, 3:]).reshape(*share.shape, 3) + poses[..., :3, 3]
+    return R, placed - share[:, None] @ placed
+
+
+def _mean_square(residual: Array, share: Array) -> Array:
+    return (share * np.einsum("pvi,pvi->pv", residual, residual)).sum(axis=1)
 
 
 def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
     """Return shifts (P, 3) of the hand-eyes X that bring the centroids closest together while the rotations stay."""
     R = poses[..., :3, :3]
     M = R - np.einsum("pv,pvij->pij", share, R)[:, None]
-    r = _centroid_residual(poses, X, centroids, share)
+    _, r = _placed(poses, X, centroids, share)
     normal = np.einsum("pv,pvki,pvkj->pij", share, M, M) + 1e-9 * np.eye(3)
     right = np.einsum("pv,pvki,pvk->pi", share, M, r)
     return -np.linalg.solve(normal, right[..., None])[..., 0]
 
 
-def _centroid_step(poses: Array, X: Array, centroids: Array, share: Array, damping: Array) -> Array:
+def _centroid_step(R: Array, residual: Array, centroids: Array, share: Array, damping: Array) -> Array:
     """Return a damped Gauss–Newton step (Levenberg–Marquardt) of P hand-eyes: right twists (P, 6).
 
+    A centroid moves by R K, K = (−[c]×, I) the same under all hand-eyes: squares about the mean need K and its mean alone.
+
     Args:
-        poses: (P, V, 4, 4) of the mount.
-        X: (P, 4, 4) hand-eyes.
+        R: (P, V, 3, 3) of the scans as they are placed.
+        residual: (P, V, 3) of the placed centroids, about their mean.
         centroids: (V, 3) of the scans, scanner frame.
         share: (P, V) weights of the views, of sum 1.
         damping: (P,) as a share of the diagonal.
     """
-    R = (poses @ X[:, None])[..., :3, :3]
-    J = np.concatenate([-R @ frames.skew(centroids)[None], R], axis=3)
-    J = J - np.einsum("pv,pvij->pij", share, J)[:, None]
-    r = _centroid_residual(poses, X, centroids, share)
-    normal = np.einsum("pv,pvki,pvkj->pij", share, J, J, optimize=True)
-    right = np.einsum("pv,pvki,pvk->pi", share, J, r, optimize=True)
+    views = len(centroids)
+    K = np.concatenate([-frames.skew(centroids), np.broadcast_to(np.eye(3), (views, 3, 3))], axis=2)
+    weighted = share[..., None, None] * R
+    mean = weighted.transpose(0, 2, 1, 3).reshape(-1, 3, 3 * views) @ K.reshape(3 * views, 6)
+    squares = share @ (K.transpose(0, 2, 1) @ K).reshape(views, 36)
+    normal = squares.reshape(-1, 6, 6) - mean.transpose(0, 2, 1) @ mean
+    right = (residual[..., None, :] @ weighted).reshape(-1, 3 * views) @ K.reshape(3 * views, 6)
     # Damped by its own diagonal: rotations and translations have scales of their own.
     diagonal = np.einsum("pii->pi", normal)
     floor = 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12
