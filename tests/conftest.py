@@ -42,15 +42,15 @@ gc.disable()
 
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
-    "test_review.py",
+    "test_stitch.py",
     "test_diagnosis.py",
-    "test_diagnose.py",
+    "test_run_page.py",
     "test_view_screening.py",
-    "test_run_folder.py",
-    "test_window.py",
-    "test_correct.py",
-    "test_sphere.py",
-    "test_commands.py",
+    "test_run.py",
+    "test_stock.py",
+    "test_first_run.py",
+    "test_ros2_node.py",
+    "test_conventions.py",
 )
 
 

@@ -139,7 +139,7 @@ def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[floa
 
 
 def _placed(poses: Array, X: Array, centroids: Array, share: Array) -> tuple[Array, Array]:
-    """Return rotations (P, V, 3, 3) of the scans placed by P hand-eyes X, and their centroids about the mean by share."""
+    """Return rotations (P, V, 3, 3) of scans placed by P hand-eyes X, and their centroids (P, V, 3) about the mean."""
     R_mount = poses[..., :3, :3].reshape(len(X), -1, 3)
     R = (R_mount @ X[:, :3, :3]).reshape(*share.shape, 3, 3)
     placed = (R @ centroids[..., None])[..., 0] + (R_mount @ X[:, :3, 3:]).reshape(*share.shape, 3) + poses[..., :3, 3]
@@ -163,7 +163,7 @@ def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) ->
 def _centroid_step(R: Array, residual: Array, centroids: Array, share: Array, damping: Array) -> Array:
     """Return a damped Gauss–Newton step (Levenberg–Marquardt) of P hand-eyes: right twists (P, 6).
 
-    A centroid moves by R K, K = (−[c]×, I) the same under all hand-eyes: squares about the mean need K and its mean alone.
+    A centroid c moves by R K, with K = (−[c]×, I) the same under all hand-eyes: sums of squares need R in the mean alone.
 
     Args:
         R: (P, V, 3, 3) of the scans as they are placed.

@@ -128,8 +128,12 @@ def test_every_name_has_an_example(name):
 PLANS = [name for name in NAMES if any("stitch.plan(" in own.source for own in example_of(name).examples)]
 
 
+# What they show the examples of the functions show too: seconds each.
+TWICE = ["Calibration", "CheckedSession", "LiveSession.finish", "Proposal", "Verification"]
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in PLANS)) for name in NAMES], ids=str
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in [*PLANS, *TWICE])) for name in NAMES], ids=str
 )
 def test_the_example_gives_what_it_says(name, names_of_examples, tmp_path):
     if "open3d" in name:

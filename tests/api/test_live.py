@@ -98,7 +98,9 @@ def test_a_copied_scan_is_said_to_be_one_and_the_next_view_is_not_accused(arrays
         assert said.verdict == "fits", said.why
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError, ValueError])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt, *(pytest.param(e, marks=pytest.mark.slow) for e in (MemoryError, ValueError))]
+)
 def test_whatever_ends_a_call_the_view_is_out(arrays, error, monkeypatch):
     clouds, poses = arrays
     live = stitch.live(mount="eye_in_hand")

@@ -250,17 +250,22 @@ def test_no_session_of_scans_ends_in_a_traceback(seed, views, traits):
     ("kind", "views", "traits"),
     [
         ("clouds", 6, ["still"]),
-        ("clouds", 4, ["part_still"]),
-        ("clouds", 5, ["copied_row"]),
-        ("clouds", 3, ["copied_row", "part_still"]),
-        ("clouds", 3, []),
-        ("clouds", 4, ["few_points"]),
-        ("clouds", 6, ["plane", "two_places"]),
         ("both", 3, ["missing_cloud"]),
         ("clouds", 5, ["missing_cloud"]),
         ("points", 4, ["no_sightings"]),
-        ("points", 3, []),
         ("points", 5, ["all_outliers"]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("clouds", 4, ["part_still"]),
+                ("clouds", 5, ["copied_row"]),
+                ("clouds", 3, ["copied_row", "part_still"]),
+                ("clouds", 3, []),
+                ("clouds", 4, ["few_points"]),
+                ("clouds", 6, ["plane", "two_places"]),
+                ("points", 3, []),
+            )
+        ),
     ],
 )
 def test_what_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(kind, views, traits):

@@ -26,6 +26,7 @@ from stitch.diagnosis.deciding_view import (
     predict_views,
     unnamed_joints,
 )
+from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.effect_trend import EffectTrend, expected_in_view, trend_in_model, trends_of_candidates
 from stitch.diagnosis.score import score
 from stitch.diagnosis.thresholds import ODDS
@@ -101,8 +102,8 @@ def cell():
     plan, rail = plan_for(scene, 3, VIEWS + FURTHER)
     measured = simulate(scene, {"gear_eccentricity": 1.5}, 3, planned=(plan, rail))
     session = session_of(measured)
-    found = stitch.diagnose(stitch.run(replace(session, views=session.views[:VIEWS])))
-    return found, measured, plan
+    run = stitch.run(replace(session, views=session.views[:VIEWS]))
+    return stitch.diagnose(run), measured, plan, run
 
 
 def rivals_of(found):
@@ -114,7 +115,7 @@ def rivals_of(found):
 
 def test_what_is_expected_of_a_further_view_is_what_it_shows_within_what_is_known(cell):
     """True poses of the generator, whose kinematics are its own: squares in units of the covariance stay small."""
-    found, measured, plan = cell
+    found, measured, plan, _ = cell
     linear = found.linear
     (true,) = [ranked for ranked in rivals_of(found) if ranked.name == "gear_eccentricity"]
     expected = predict_views(linear, [true.score], plan.joints[VIEWS:], np.zeros(FURTHER))[0]
@@ -130,7 +131,7 @@ def test_what_is_expected_of_a_further_view_is_what_it_shows_within_what_is_know
 
 
 def test_proposed_poses_are_near_those_driven_and_their_odds_rise_with_each(cell):
-    found, _, plan = cell
+    found, _, plan, _ = cell
     views = deciding_views(found.linear, rivals_of(found))
     assert views is not None
     assert (np.diff(views.probability) > -0.02).all()
@@ -158,10 +159,8 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
 
 def test_the_law_of_an_effect_that_was_added_is_drawn_as_it_was_before(cell):
     """Dots before: as without it, and small with it; the line is what it does, whatever its other parameters are."""
-    found, measured, _ = cell
-    session = session_of(measured)
-    added = stitch.add(stitch.run(replace(session, views=session.views[:VIEWS])), "gear_eccentricity")
-    linear = stitch.diagnose(added).linear
+    found, *_, run = cell
+    linear = linear_model_of(stitch.add(run, "gear_eccentricity"))
     score = next(ranked.score for ranked in rivals_of(found) if ranked.name == "gear_eccentricity")
     before = trends_of_candidates(found.linear, [score])["gear_eccentricity"]
     now = trend_in_model(linear, linear.model.terms[-1])
@@ -248,6 +247,7 @@ def test_dots_are_the_same_whatever_candidate_is_drawn(cells: list[FreedBlade]):
     assert any(np.abs((t.measured - t.predicted) / t.sigma).max() > 5 for t in trends.values())
 
 
+@pytest.mark.slow
 def test_dots_lie_about_the_true_displacement_within_their_sigma(cells: list[FreedBlade]):
     """Chi square a view is one: about the truth, not about the line of the candidate that happens to be drawn."""
     squares, about_wrong = [], []

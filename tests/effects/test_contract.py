@@ -44,7 +44,9 @@ KINDS = {
     "moment": per_moment("rad/(N m)", 1e-6, 1e-3),
     "twist": twist("", 1e-4, 0.1),
 }
-PAIRS = [kinds for n in (1, 2) for kinds in combinations(KINDS, n) if not all(KINDS[kind].grid for kind in kinds)]
+ALONE_OR_PAIRED = [
+    kinds for n in (1, 2) for kinds in combinations(KINDS, n) if not all(KINDS[kind].grid for kind in kinds)
+]
 
 
 @cache
@@ -104,10 +106,17 @@ def test_every_kind_is_among_those_that_are_tried():
 
 
 # External axes have kinds of their own, and tests beside them.
-@pytest.mark.parametrize("place", [place for place in PLACES if place != "axis"])
-def test_no_pair_of_kinds_ends_a_diagnosis(place):
+OWN_PLACES = [place for place in PLACES if place != "axis"]
+
+
+@pytest.mark.parametrize(
+    ("place", "most"),
+    [(place, 1 + (place == "robot")) for place in OWN_PLACES]
+    + [pytest.param(place, 2, marks=pytest.mark.slow) for place in OWN_PLACES if place != "robot"],
+)
+def test_no_kind_and_no_pair_of_kinds_ends_a_diagnosis(place, most):
     model = linear()
-    for kinds in PAIRS:
+    for kinds in (kinds for kinds in ALONE_OR_PAIRED if len(kinds) <= most):
         own = registered(place, kinds)
         names = [p.name for p in parameters_in(model.measurement, own) if not p.grid]
         candidate = candidate_of(model, own)

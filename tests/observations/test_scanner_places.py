@@ -8,6 +8,7 @@ import pytest
 import stitch
 from data_synth.cells.scanner_cell import scanner_cell, write_scanners
 from stitch.cli.main import main
+from stitch.effects import EFFECTS
 from stitch.numerics import frames
 
 CELL = scanner_cell("stands", 22, {"field_curvature": (1, 2.0)})
@@ -29,7 +30,12 @@ def exit_code(call):
     return ended.value.code
 
 
-def test_one_scanners_own_effect_is_named_for_that_one(run):
+@pytest.mark.parametrize("library", ["of scanners", pytest.param("whole", marks=pytest.mark.slow)])
+def test_one_scanners_own_effect_is_named_for_that_one(run, library, monkeypatch):
+    """Among what scanners and their mounts may do, and among all effects."""
+    for name in [name for name, own in EFFECTS.items() if own.place not in ("sensor", "mount")]:
+        if library == "of scanners":
+            monkeypatch.delitem(EFFECTS, name)
     assert stitch.diagnose(run).effects == ("field_curvature@right",)
 
 

@@ -62,7 +62,10 @@ def test_scans_name_the_mistake(cell, mistake):
     assert found and found[0].hypothesis.kind in kinds
 
 
-@pytest.mark.parametrize("mistake", ["inverse", "mount", "inches", "shifted by one"])
+@pytest.mark.parametrize(
+    "mistake",
+    ["inches", "shifted by one", *(pytest.param(name, marks=pytest.mark.slow) for name in ("inverse", "mount"))],
+)
 def test_labelled_points_name_the_mistake(cell, mistake):
     session, _ = cell
     spoil, kinds = MISTAKES[mistake]
@@ -144,13 +147,15 @@ def with_joints(session, change):
     return replace(session, views=tuple(replace(v, joints=own, T_base_flange=T) for v, own, T in every))
 
 
-@pytest.mark.parametrize("said", JOINTS)
+@pytest.mark.parametrize(
+    "said", [pytest.param(said, marks=[pytest.mark.slow] * ("other way" in said)) for said in JOINTS]
+)
 def test_joints_that_count_otherwise_are_named(said):
     (problem,) = check_targets(with_joints(labelled_cell(seed=4, views=12)[0], JOINTS[said]))
     assert said in problem.fix
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_what_moved_as_a_whole_is_named_with_the_row(mount):
     session, D = (
         labelled_cell(seed=2, views=400, mount=mount)[0],

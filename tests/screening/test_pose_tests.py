@@ -334,7 +334,7 @@ def test_a_view_that_is_off_is_no_factor():
 
 
 @pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("seed", [40, 41])
+@pytest.mark.parametrize("seed", [40, pytest.param(41, marks=pytest.mark.slow)])
 def test_a_bad_arm_is_neither_refused_nor_said_to_have_moved(world, seed):
     assert bad_arm({"world": world, "times": 0.0, "seed": seed})["found"] == []
 

@@ -38,6 +38,7 @@ def with_casting(size, share):
     return replace(measured, clouds=[raised if v == VIEW else cloud for v, cloud in enumerate(measured.clouds)])
 
 
+@pytest.mark.usefixtures("no_drawing")
 def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     """It is taken off where it is; a run that was saved knows it again. The pose is as near the truth as is stated."""
     measured = with_casting(0.2, 0.5)
@@ -48,11 +49,11 @@ def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     assert abs(scan.stock.thickness - 0.2) < 3 * scan.stock.sigma < 0.03
     assert found.left_out == ()
     assert "v008 shows its surface" in found.doubts[0] and "outside" in found.doubts[0]
-    found.save(tmp_path / "run")
+    found.save(tmp_path / "run", recording=False)
     (again,) = (s for s in stitch.load_run(tmp_path / "run").measurement.capture.scans if s.stock is not None)
     assert again.stock.thickness == pytest.approx(scan.stock.thickness)
     assert np.mean(again.stock.points == scan.stock.points) > 0.98
-    stitch.load_run(tmp_path / "run").save(tmp_path / "again")
+    stitch.load_run(tmp_path / "run").save(tmp_path / "again", recording=False)
     (row,) = json.loads((tmp_path / "again" / "result.json").read_text(encoding="utf-8"))["stock"]
     middle = frames.transform(found.poses[VIEW], scan.points.mean(axis=0)[None])[0]
     to_middle = frames.make(np.eye(3), -middle)
@@ -63,7 +64,7 @@ def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     assert max(row["pose_sigma"][3:]) < 0.03
 
 
-@pytest.mark.parametrize("turn", [0.0, 3e-3])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.slow), 3e-3])
 def test_a_displaced_view_is_never_called_stock(turn):
     measured = measured_blade(**CELL)
     T = np.array(measured.T_base_flange)

@@ -101,6 +101,11 @@ def test_arrays_with_an_axis_are_the_session_of_a_folder(tmp_path):
     assert np.allclose(session.scanner.T_mount[:3, :3] @ direction, [0, 0, 1], atol=1e-9)
 
 
+@pytest.fixture(scope="module")
+def three_views():
+    return axis_cell("table-arm", 5, views=3, pixels=20)
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -114,9 +119,8 @@ def test_arrays_with_an_axis_are_the_session_of_a_folder(tmp_path):
         ({"name": "drum"}, "axis drum has 0 columns of readings; to fix: give it one, drum_deg"),
     ],
 )
-def test_a_table_of_an_axis_that_cannot_be_is_refused_in_one_line(tmp_path, table, words):
-    cell = axis_cell("table-arm", 5, views=3, pixels=20)
-    write_cell(tmp_path / "s", cell, [table], cell.T_mount)
+def test_a_table_of_an_axis_that_cannot_be_is_refused_in_one_line(tmp_path, three_views, table, words):
+    write_cell(tmp_path / "s", three_views, [table], three_views.T_mount)
     with pytest.raises(stitch.InputError, match=words) as refusal:
         stitch.load_session(tmp_path / "s")
     assert "\n" not in str(refusal.value)

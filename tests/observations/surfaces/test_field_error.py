@@ -205,6 +205,7 @@ def test_the_likelihood_has_the_slopes_that_it_says():
         assert check_grad(value, slope, point) < 1e-5 * max(1.0, np.linalg.norm(slope(point)))
 
 
+@pytest.mark.slow
 def test_sizes_are_those_with_which_errors_were_drawn():
     """Errors of three causes drawn by their variances: log shares within three of their standard errors on average."""
     rng = np.random.default_rng(1)

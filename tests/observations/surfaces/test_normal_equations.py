@@ -289,6 +289,7 @@ def test_sums_of_targets_are_the_slopes_of_what_sets_them_apart():
         np.testing.assert_allclose(slope, own_sums[g.labelled], atol=1e-3 * np.abs(own_sums[g.labelled]).max())
 
 
+@pytest.mark.slow
 def test_poses_of_many_views_lie_as_near_the_truth_as_with_all_partners(monkeypatch):
     """Mean square displacement along the normals, after the motion common to all: no 5 % more, in two cells."""
     squares = []

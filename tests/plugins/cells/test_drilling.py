@@ -1,9 +1,10 @@
 """Drilling: every step against truth or a closed form, and the whole experiment against the published errors."""
 
 import json
-import pickle
 import shutil
+import socketserver
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -524,41 +525,52 @@ def test_trials_name_what_is_wrong(tmp_path):
         read_drill_job(tmp_path / "job.toml")
 
 
+# A program that starts at once: what it is asked it asks the cell in the test's own process.
 MACHINE = """
-import json, pathlib, pickle, sys
-import numpy as np
-from scipy.spatial.transform import Rotation
+import json, socket, sys
 question = json.load(sys.stdin)
-pose = question["pose"]
 if question["hole"] == "{unreachable}":
     print("joint 5 ends at 118 deg", file=sys.stderr)
     sys.exit(3)
-store = pathlib.Path(__file__).with_name("cell.pickle")
-cell = pickle.loads(store.read_bytes())
-T = np.eye(4)
-T[:3, :3] = Rotation.from_euler("ZYX", [pose["a_deg"], pose["b_deg"], pose["c_deg"]], degrees=True).as_matrix()
-T[:3, 3] = pose["x"], pose["y"], pose["z"]
-ranges, uv = cell.measure(question["hole"], T)
-store.write_bytes(pickle.dumps(cell))
-print(json.dumps({{"rangers": {{f"L{{i + 1}}": d for i, d in enumerate(ranges)}}, "uv": uv.tolist()}}))
+with socket.create_connection({address}) as asked, asked.makefile("rw") as lines:
+    print(json.dumps(question), file=lines, flush=True)
+    print(lines.readline())
 """
+
+
+class CellServer(socketserver.StreamRequestHandler):
+    """Answers where the tool was placed with what the simulated cell measures there."""
+
+    def handle(self):
+        question = json.loads(self.rfile.readline())
+        pose = question["pose"]
+        angles = [pose["a_deg"], pose["b_deg"], pose["c_deg"]]
+        R = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+        T = frames.make(R, np.array([pose["x"], pose["y"], pose["z"]]))
+        ranges, uv = self.server.cell.measure(question["hole"], T)
+        told = {"rangers": {f"L{i + 1}": d for i, d in enumerate(ranges)}, "uv": uv.tolist()}
+        self.wfile.write(json.dumps(told).encode() + b"\n")
 
 
 @pytest.fixture
 def driven_job(tmp_path):
-    """A job of one group of which the tool was placed on no hole yet, and the command that drives the simulated cell."""
+    """A job of one group of which the tool was placed on no hole yet, and the cell that is driven, with its address."""
     cell = DrillingCell(5)
     write_job(tmp_path, cell)
     (tmp_path / "placed.csv").unlink()
     lines = (tmp_path / "holes.csv").read_text(encoding="utf-8").splitlines(keepends=True)
     kept = [lines[0], *(line for line in lines[1:] if line.split(",")[1] == "1")]
     (tmp_path / "holes.csv").write_text("".join(kept), encoding="utf-8")
-    (tmp_path / "cell.pickle").write_bytes(pickle.dumps(cell))
-    return tmp_path, cell
+    with socketserver.TCPServer(("127.0.0.1", 0), CellServer) as server:
+        server.cell = cell
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        yield tmp_path, cell, server.server_address
+        server.shutdown()
 
 
-def drive(folder, unreachable="", *arguments):
-    (folder / "machine.py").write_text(MACHINE.format(unreachable=unreachable), encoding="utf-8")
+def drive(folder, address, unreachable="", *arguments):
+    program = MACHINE.format(unreachable=unreachable, address=address)
+    (folder / "machine.py").write_text(program, encoding="utf-8")
     with pytest.raises(SystemExit) as stop:
         main(["drill", str(folder / "job.toml"), "--servo", f"{sys.executable} {folder / 'machine.py'}", *arguments])
     return stop.value.code
@@ -566,13 +578,13 @@ def drive(folder, unreachable="", *arguments):
 
 def test_servo_drives_the_cell_to_the_published_errors(driven_job, capsys):
     """Cut short by a hole out of reach, the call keeps what it has; the next one goes on and ends upright on all holes."""
-    folder, cell = driven_job
-    assert drive(folder, "105") == 1
+    folder, cell, address = driven_job
+    assert drive(folder, address, "105") == 1
     message = capsys.readouterr().err
     assert "hole 105" in message and "cannot reach" in message and "joint 5 ends at 118 deg" in message
     placed = (folder / "placed.csv").read_text(encoding="utf-8").splitlines()
     assert [line.split(",")[0] for line in placed] == ["hole", "101", "102"]
-    assert drive(folder, "", "-o", str(folder / "drives.csv"), "--json") == 0
+    assert drive(folder, address, "", "-o", str(folder / "drives.csv"), "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert (folder / "placed.csv").read_text(encoding="utf-8").startswith("\n".join(placed))
     rows = np.genfromtxt(folder / "drives.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -584,7 +596,7 @@ def test_servo_drives_the_cell_to_the_published_errors(driven_job, capsys):
 
 
 def test_what_a_servo_command_prints_is_checked(driven_job):
-    folder, _ = driven_job
+    folder, *_ = driven_job
     message = ended("drill", folder / "job.toml", "--servo", "echo 12", code=1).err
     assert "hole 101" in message and '"uv": [u, v]' in message
     told = ended("drill", folder / "job.toml", "--servo", "no-such-program", code=2)

@@ -157,7 +157,7 @@ def made(tmp_path, name, campaign, **stated):
 
 QUICK = ["kuka-e6pos", "halcon-abg", "pose-graph", "colmap", "one-ptx", "pts-with-count", "ply-blank-lines"]
 QUICK += ["joint-states-yaml", "label-colon", "units-in-cells", "empty-cloud", "row-of-minus-inf", "code-minus-9999"]
-QUICK += ["clouds-in-cm", "code-z-32.768-m", "trigger-words", "rtde-125hz"]
+QUICK += ["clouds-in-cm", "code-z-32.768-m", "rtde-125hz", pytest.param("trigger-words", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -237,7 +237,7 @@ def test_profiles_of_a_sphere_become_a_session_for_its_calibration(tmp_path, cam
     assert load_session(tmp_path / "made").sphere_radius == 25.0
 
 
-@pytest.mark.parametrize("others", [slice(4, None), slice(1, None, 2)])
+@pytest.mark.parametrize("others", [slice(4, None), pytest.param(slice(1, None, 2), marks=pytest.mark.slow)])
 def test_scans_of_two_parts_are_told_by_name_and_those_of_one_are_not(tmp_path, others):
     """The second part is the first one sheared, scanned at right poses."""
     measured = measured_blade(13, 8, "eye_in_hand", (0.0, 0.0), pixels=60)

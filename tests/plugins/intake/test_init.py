@@ -20,7 +20,7 @@ from stitch.session.capture import prepare_capture
 from stitch.session.reading.session_folder import load_session
 from tests.needs import needs
 
-SLOW = ("SpatialAnalyzer", "OptiTrack by time")
+SLOW = ("SpatialAnalyzer", "OptiTrack by time", "Leica's text", "geodetic, by order")
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, mon
         (lambda raw: (raw / "RobotPoses.dat").unlink(), (), "--poses"),
         (lambda raw: [f.unlink() for f in raw.glob("*.ply")], (), "no clouds there, only 1 .dat"),
         (lambda raw: [f.rename(f.with_suffix(".zip")) for f in raw.glob("*.ply")], (), "unpack it"),
-        (second_table, (), "several lists"),
+        (second_table, STATED, "several lists"),
         (lambda raw: None, ("--rotation", "zyx"), "--rotation zyx: to fix: use xyz-intrinsic"),
         (lambda raw: None, ("--columns", "x,y,z"), "3 names"),
         (lambda raw: None, ("--columns", "x,x,z,rx,ry,rz"), "x stands twice"),
@@ -173,7 +173,7 @@ def test_what_cannot_be_a_session_is_refused_in_one_line(raw, capsys, spoil, arg
     assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
 
 
-@pytest.mark.parametrize("arguments", [(), ("--rows", "1-2")])
+@pytest.mark.parametrize("arguments", [STATED[:-2], ("--rows", "1-2")])
 def test_a_question_is_asked_in_the_json_with_what_is_known_by_then(raw, capsys, arguments):
     """Without --yes nobody guesses: what cannot be told is the question, and nothing is written."""
     code, out, err = ended(capsys, "init", raw, "--json", *arguments)

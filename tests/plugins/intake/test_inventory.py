@@ -202,7 +202,12 @@ def test_of_the_first_few_views_the_others_changed():
 
 
 @pytest.mark.parametrize(
-    ("side", "views"), [("tool", slice(1, None, 2)), ("base", slice(1, None, 2)), ("base", [1, 3, 6, 8])]
+    ("side", "views"),
+    [
+        ("tool", slice(1, None, 2)),
+        ("base", [1, 3, 6, 8]),
+        pytest.param("base", slice(1, None, 2), marks=pytest.mark.slow),
+    ],
 )
 def test_two_lists_in_one_table_are_named_with_their_views(side, views):
     change = frames.make(np.eye(3), np.array([0.0, 30.0, 150.0]))

@@ -235,13 +235,16 @@ def _measured_errors(size: float, length: float, seed: int):
     return place_errors(run(session_of(simulated(scene, {}, seed, views=6)))).scan_errors
 
 
-@pytest.mark.parametrize(("size", "length", "seed"), [(0.01, 0.1, 3), (0.02, 0.2, 4)])
+@pytest.mark.parametrize(
+    ("size", "length", "seed"), [(0.01, 0.1, 3), pytest.param(0.02, 0.2, 4, marks=pytest.mark.slow)]
+)
 def test_the_overlaps_show_how_large_errors_of_single_scans_are(size, length, seed):
     errors = _measured_errors(size, length, seed)
     # Some thirty patches of a length in each of six scans, of which poses take up a part: a sigma known to a tenth.
     assert 0.6 < errors.size / size < 1.4
 
 
+@pytest.mark.slow
 def test_the_modes_hold_the_variance_and_the_correlation_of_what_the_simulator_draws():
     errors = _measured_errors(0.02, 0.15, 5)
     scanner = Scanner(field_of_view=48.0, field_of_view_y=40.0, scan_error=errors.size, scan_error_length=0.15)
@@ -254,6 +257,7 @@ def test_the_modes_hold_the_variance_and_the_correlation_of_what_the_simulator_d
     assert np.abs(modelled[0, 4:]).max() < 0.15 * errors.size**2
 
 
+@pytest.mark.slow  # two whole runs
 def test_the_order_of_the_views_changes_nothing(monkeypatch):
     scene = clean("spheres", rays=60, noise=0.02, scan_error=0.02, scan_error_length=0.2)
     session = session_of(simulated(replace(scene, repeatability=(15e-6, 0.01)), {}, 6, views=5))

@@ -89,6 +89,8 @@ def test_everybody_can_read_and_reach_the_page(browser, address, colours):
     page.close()
 
 
+# In `make test` piece by piece: test_first_run.py, test_web_app.py.
+@pytest.mark.slow
 def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story = Story(browser, address)
     story.says("#tiles", "rms on held-out views")

@@ -337,7 +337,7 @@ def test_a_table_that_is_worse_on_another_day_is_not_written():
     assert table.sentence("mm").startswith("The best table leaves")
 
 
-def test_the_command_says_what_was_proved_where(tmp_path, days):
+def test_the_command_says_what_was_proved_where(tmp_path, few_effects):
     for name, seed in (("monday", 41), ("tuesday", 42)):
         write_labelled(tmp_path / name, labelled_cell(seed, views=40, offset=OFFSET)[0])
     arguments = ["calibrate", "robot", str(tmp_path / "monday"), "--on", str(tmp_path / "tuesday"), "-o"]
