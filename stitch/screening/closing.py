@@ -163,7 +163,7 @@ def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) ->
 def _centroid_step(R: Array, residual: Array, centroids: Array, share: Array, damping: Array) -> Array:
     """Return a damped Gauss–Newton step (Levenberg–Marquardt) of P hand-eyes: right twists (P, 6).
 
-    A centroid c moves by R K, with K = (−[c]×, I) the same under all hand-eyes: sums of squares need R in the mean alone.
+    A centroid c moves by R K with K = (−[c]×, I): R cancels in the squares, and stays in their mean.
 
     Args:
         R: (P, V, 3, 3) of the scans as they are placed.
