@@ -48,7 +48,6 @@ LONGEST = (
     "test_view_screening.py",
     "test_run.py",
     "test_stock.py",
-    "test_first_run.py",
     "test_ros2_node.py",
     "test_conventions.py",
 )

@@ -142,7 +142,7 @@ def test_from_python_the_method_is_that_of_the_command(session):
     assert stitch.run_rig([loaded], register="gicp")[0].register_method == "gicp"
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", [pytest.param("eye_to_hand", marks=pytest.mark.slow), "eye_in_hand"])
 def test_few_views_under_another_mount_gain_from_a_known_arm(mount):
     arm = arm_of(0)
     session, T_mount, _ = labelled_cell(1, views=8, mount=mount, offset=OFFSET)

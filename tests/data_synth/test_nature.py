@@ -222,7 +222,15 @@ def test_amplitude_zero_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    "name", ["range_scale", "part_growth", "part_sag", "part_slip", "fixture_drift", "mount_drift"]
+    "name",
+    [
+        "range_scale",
+        pytest.param("part_growth", marks=pytest.mark.slow),
+        "part_sag",
+        "part_slip",
+        "fixture_drift",
+        "mount_drift",
+    ],
 )
 def test_labelled_points_follow_the_laws_too(name):
     """Centres of spheres move with the part and are reported through the scanner, as the cloud is."""
@@ -333,7 +341,14 @@ def test_latency_of_a_line_scanner():
 
 @pytest.mark.parametrize(
     "scene",
-    ["blade", "blade-table", "panel", "spheres", pytest.param("car-door", marks=pytest.mark.slow), "drill-plate"],
+    [
+        "blade",
+        "blade-table",
+        "panel",
+        "spheres",
+        pytest.param("car-door", marks=pytest.mark.slow),
+        pytest.param("drill-plate", marks=pytest.mark.slow),
+    ],
 )
 def test_nothing_hidden_leaves_noise_alone(scene):
     """Clouds placed by the true poses: distances to the part over their sigma are a normal distribution."""

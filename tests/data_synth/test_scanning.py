@@ -197,7 +197,7 @@ def fit_sphere(points: np.ndarray, sigma: np.ndarray, start: float) -> tuple[flo
     return found.x[3], np.sqrt(np.linalg.inv(found.jac.T @ found.jac)[3, 3])
 
 
-@pytest.mark.parametrize("radius", [12.0, 30.0])
+@pytest.mark.parametrize("radius", [12.0, pytest.param(30.0, marks=pytest.mark.slow)])
 def test_a_sphere_has_its_radius(radius):
     tolerance = 1e-3 * radius / 30
     scene = with_part(clean("blade", rays=110), "sphere", radius=radius, tolerance=tolerance)
@@ -214,7 +214,9 @@ def test_a_sphere_has_its_radius(radius):
     assert (np.abs(value - radius) < 4 * error + tolerance).all()
 
 
-@pytest.mark.parametrize("name", ["blade", "blade-table", "panel", "spheres", "drill-plate"])
+@pytest.mark.parametrize(
+    "name", ["blade", "blade-table", "panel", "spheres", pytest.param("drill-plate", marks=pytest.mark.slow)]
+)
 def test_views_show_enough_and_overlap(name):
     scene = clean(name, rays=40)
     measured = simulated(scene, {}, 2, 4)

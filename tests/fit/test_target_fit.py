@@ -48,7 +48,7 @@ def off(T, true):
     )
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_hand_eye_and_targets_with_their_sigmas(mount):
     z = []
     for seed in range(6):

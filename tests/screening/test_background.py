@@ -25,7 +25,7 @@ GRID = np.stack(np.meshgrid(SIDE, SIDE), axis=-1).reshape(-1, 2)
 
 @pytest.fixture(scope="module")
 def blade():
-    return measured_blade(21, views=BLADE_VIEWS, pixels=80)
+    return measured_blade(21, views=BLADE_VIEWS, pixels=60)
 
 
 def with_squares(blade, shown_by):

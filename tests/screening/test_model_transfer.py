@@ -143,7 +143,9 @@ def test_two_arms_in_one_fit_are_doubted():
         assert any(f"day {k} does not share the effects of this rig" in doubt for doubt in r.doubts)
 
 
-@pytest.mark.parametrize("effects", [["joint_offset"], ["joint_offset", "link_geometry"], []])
+@pytest.mark.parametrize(
+    "effects", [pytest.param(["joint_offset"], marks=pytest.mark.slow), ["joint_offset", "link_geometry"], []]
+)
 def test_one_arm_is_not(effects):
     assert not any("does not share" in doubt for r in run_rig(two_days(OFFSETS), effects=effects) for doubt in r.doubts)
 

@@ -67,7 +67,7 @@ def test_views_that_most_others_do_not_meet_stand_alone_and_groups_do_not(cell):
     assert alone((0, 1, 2), *((v,) for v in range(3, 12))) == ()
 
 
-@pytest.mark.parametrize("shift", [1.0, 40.0])
+@pytest.mark.parametrize("shift", [1.0, pytest.param(40.0, marks=pytest.mark.slow)])
 def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
     measured, own = cell
     twist = np.r_[0, 0, 0, shift * np.array([0.6, 0.0, 0.8])]

@@ -54,7 +54,7 @@ def test_real_tracker(shared_data):
     assert max(c["translation"] for c in document["closed_forms"].values()) < 1.0
 
 
-@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_error_is_that_of_the_covariance(mount, tmp_path):
     squares = []
     for seed in range(20):
@@ -160,7 +160,7 @@ def test_two_hundred_cells_no_worse_than_opencv():
         assert rms(np.array(closed)[:, k]) <= rms(np.array(theirs["SHAH"])[:, k])
 
 
-@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("robust", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_covariance_predicts_the_error(robust):
     """Mean squared Mahalanobis distance over cells: 12 if the covariance is the error's."""
     squares = []
