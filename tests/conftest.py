@@ -4,7 +4,7 @@ import gc
 import io
 import os
 import shutil
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,14 +152,29 @@ def session(_blade_on_disk, tmp_path):
     return Path(shutil.copytree(_blade_on_disk, tmp_path / "s"))
 
 
+@pytest.fixture(scope="session")
+def library_of():
+    """A context in which the library holds some effects alone."""
+
+    @contextmanager
+    def only(names):
+        whole = dict(EFFECTS)
+        for name in whole.keys() - set(names):
+            del EFFECTS[name]
+        yield
+        # In their order: what is drawn at random goes by it.
+        EFFECTS.clear()
+        EFFECTS.update(whole)
+
+    return only
+
+
+FEW = ("joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash")
+
+
 @pytest.fixture
-def few_effects(monkeypatch):
+def few_effects(monkeypatch, library_of):
     """A small library: what is tested is the choice, not how long all of it takes."""
-    whole = dict(EFFECTS)
-    for name in set(EFFECTS) - {"joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash"}:
-        del EFFECTS[name]
     monkeypatch.setattr(candidates, "empirical_effects", lambda views: [])
-    yield
-    # In their order: what is drawn at random goes by it.
-    EFFECTS.clear()
-    EFFECTS.update(whole)
+    with library_of(FEW):
+        yield

@@ -23,6 +23,13 @@ from stitch.session.reading.session_folder import load_session
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_library(library_of):
+    """What follows a diagnosis is tested here, and not how long all of one takes."""
+    with library_of(("joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash", "settling")):
+        yield
+
+
 @pytest.fixture(scope="module")
 def first():
     session, *_ = labelled_cell(1, views=24, offset=OFFSET)

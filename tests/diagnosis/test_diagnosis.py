@@ -302,6 +302,7 @@ def test_four_times_the_scatter_of_an_ordinary_arm_is_more_than_expected(scatter
     assert not beyond_expected(linear, expected_scatter(linear, known))
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_scatter_beyond_what_is_stated_is_not_adequate():
     """The cell's arm scatters by 20 µm a coordinate, RP 72 µm: stated as 80 µm it is adequate, as 20 µm it is not."""
     session, *_ = labelled_cell(5, views=24, scatter=(1e-5, 0.02))

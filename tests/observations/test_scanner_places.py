@@ -8,7 +8,7 @@ import pytest
 import stitch
 from data_synth.cells.scanner_cell import scanner_cell, write_scanners
 from stitch.cli.main import main
-from stitch.effects import EFFECTS
+from stitch.effects.contract import EFFECTS, PLACES
 from stitch.numerics import frames
 
 CELL = scanner_cell("stands", 22, {"field_curvature": (1, 2.0)})
@@ -31,12 +31,11 @@ def exit_code(call):
 
 
 @pytest.mark.parametrize("library", ["of scanners", pytest.param("whole", marks=pytest.mark.slow)])
-def test_one_scanners_own_effect_is_named_for_that_one(run, library, monkeypatch):
+def test_one_scanners_own_effect_is_named_for_that_one(run, library, library_of):
     """Among what scanners and their mounts may do, and among all effects."""
-    for name in [name for name, own in EFFECTS.items() if own.place not in ("sensor", "mount")]:
-        if library == "of scanners":
-            monkeypatch.delitem(EFFECTS, name)
-    assert stitch.diagnose(run).effects == ("field_curvature@right",)
+    places = {"of scanners": ("sensor", "mount"), "whole": PLACES}[library]
+    with library_of([name for name, own in EFFECTS.items() if own.place in places]):
+        assert stitch.diagnose(run).effects == ("field_curvature@right",)
 
 
 def test_each_hand_eye_lies_within_three_sigma_and_is_known_better_than_alone(better):

@@ -22,7 +22,7 @@ from stitch.session.session import Cloud, Sighting
 
 @pytest.fixture(scope="module")
 def good():
-    return session_of(measured_blade(21, views=10, pixels=60))
+    return session_of(measured_blade(21, views=10, pixels=80))
 
 
 def with_view(session, number, **changes):
