@@ -82,7 +82,16 @@ def drop(
 
 
 def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, as_json: bool) -> None:
-    """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
+    """Replace the fit in a run folder by one with these effects, and print it.
+
+    A fit with the same effects that the run had before is restored instead of being computed again.
+
+    Args:
+        run: run folder.
+        state: the run that was read from it.
+        effects: names of all effects of the new model.
+        recording: write recording.rrd anew.
+    """
     from stitch.api.pipeline import change
     from stitch.api.stepwise import with_prediction
     from stitch.output import run_folder
@@ -109,7 +118,15 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
 
 
 def _predicted(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> float:
-    """Return the error on views left out that a diagnosis predicts of the one effect that is added; else NaN."""
+    """Return the error on views left out (length_unit) that a diagnosis predicts with one more effect.
+
+    NaN where several effects are added or some dropped, or where the diagnosis did not predict it.
+
+    Args:
+        standing: diagnosis.json of the run; {} without one.
+        state: the run before the change.
+        effects: names of all effects of the new model.
+    """
     added = set(effects) - set(state.effects)
     rows = [row for row in standing.get("candidates", []) if {row["effect"]} == added]
     known = [row["heldout_rms_if_added"] for row in rows if row["heldout_rms_if_added"] is not None]
@@ -117,8 +134,13 @@ def _predicted(standing: dict[str, Any], state: RunData, effects: Sequence[str])
 
 
 def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> str:
-    """Return which effects fit these views as well as those that are added now; empty where a diagnosis tells them
-    apart."""
+    """Return a sentence on the alternatives to the added effects that a diagnosis could not rule out; "" without any.
+
+    Args:
+        standing: diagnosis.json of the run; {} without one.
+        state: the run before the change.
+        effects: names of all effects of the new model.
+    """
     undecided = standing.get("effects", []) if standing.get("verdict") == "cannot_tell" else []
     added = [name for name in undecided if name in effects and name not in state.effects]
     laws = [row["words"] for row in standing.get("laws", [])]
@@ -132,7 +154,13 @@ def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -
 def _add_diagnosed(
     run: Path, at_most: int | None, effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
 ) -> None:
-    """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
+    """Add the effects that a diagnosis chooses to a run, print what happened, and write run and diagnosis.
+
+    Args:
+        run: run folder.
+        at_most: number of effects that may be added one by one; None: add a group that it cannot tell apart at once.
+        recording: write recording.rrd anew.
+    """
     from stitch.api.stepwise import suggest, suggest_group
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output import run_folder
@@ -144,6 +172,7 @@ def _add_diagnosed(
     memory = RunMemory()
     with opened_run(run, effects_file, trust, "diagnosing") as state:
         with show_activity("diagnosing"):
+            # A diagnosis that is still valid and names nothing saves another one.
             standing = {} if at_most is None else standing_diagnosis(run, state)
             if standing.get("verdict", "missing_effect") != "missing_effect" and "next_command" in standing:
                 _show_nothing_missing(standing, run, as_json)
@@ -158,7 +187,7 @@ def _add_diagnosed(
         if result is None:
             _show_unchanged(run, as_json)
         else:
-            # Who reads it waits for no files; a program that reads JSON takes it for the end.
+            # People see the report before the files are written; a program takes JSON for the end, so it comes last.
             if not as_json:
                 _show_changed(result, run, as_json)
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
@@ -174,7 +203,7 @@ def _add_diagnosed(
 
 
 def _show_nothing_missing(standing: dict[str, Any], run: Path, as_json: bool) -> None:
-    """Print what a standing diagnosis says, which names nothing to be added."""
+    """Print a stored diagnosis that names nothing to be added, and the next command."""
     from stitch.output.diagnosis_document import finding_lines
 
     for line in finding_lines(standing)[: None if in_full() else 1]:
@@ -185,6 +214,7 @@ def _show_nothing_missing(standing: dict[str, Any], run: Path, as_json: bool) ->
 
 
 def _show_unchanged(run: Path, as_json: bool) -> None:
+    """Print that nothing was added, or result.json of the run folder as it is."""
     if as_json:
         emit((run / "result.json").read_text(encoding="utf-8").rstrip())
     else:
@@ -192,8 +222,10 @@ def _show_unchanged(run: Path, as_json: bool) -> None:
 
 
 def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
-    """Print the report of a changed run and which others of its rig were left as they were, or its result as JSON."""
+    """Print the report of a changed run, or its result as JSON.
 
+    Runs of several sessions share a model.toml; a line says that the others in that folder still have the old model.
+    """
     from stitch.cli.run import show_report
     from stitch.output.json_file import others_of_rig, to_json
     from stitch.output.result_document import result_document
@@ -214,7 +246,10 @@ def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
 
 
 def remarks(result: RunData) -> list[str]:
-    """Return whether the effects earned their place, and whether they are of a believable size."""
+    """Return sentences on effects that do not help, have an implausible size, or do not differ from zero.
+
+    An effect helps if the error on views left out fell in the last step of the ledger, in which it was added.
+    """
     from stitch.diagnosis.ranking import beyond_belief_text
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 
@@ -244,10 +279,12 @@ def remarks(result: RunData) -> list[str]:
 
 
 def _unseen_in_residuals(names: str, clear: float, residual: str) -> str:
-    """Return what is to be said of effects with which the held-out residual is no smaller.
+    """Return a sentence on added effects with which the residual on views left out is no smaller.
 
     Args:
-        clear: sigmas by which their clearest number differs from zero.
+        names: of the effects, as text.
+        clear: largest distance of their parameters from zero, in sigmas.
+        residual: "rose" or "did not fall".
     """
     from stitch.diagnosis.thresholds import CLEAR_SIGMAS, FAINT_SIGMAS
 

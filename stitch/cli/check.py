@@ -40,7 +40,7 @@ def check(
 
 
 def _check_readable(sessions: list[Path], as_json: bool) -> None:
-    """Say what sessions hold; exit code 2 where one cannot be read."""
+    """Print what sessions hold, and why others cannot be read; exit code 2 if there are such."""
     from stitch.api.check import session_summary
     from stitch.session.reading.session_folder import load_session
 
@@ -64,7 +64,10 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
 
 
 def _check_deeply(sessions: list[Path], as_json: bool) -> None:
-    """Try every usual mistake on each session; exit code 2 where something is wrong for certain."""
+    """Search each session for usual mistakes and print those found.
+
+    Exit code 2 if a session cannot be read, or if a mistake is certain.
+    """
     from stitch.output.json_file import to_json
 
     with show_activity("trying the usual mistakes"):
@@ -88,7 +91,10 @@ def _check_deeply(sessions: list[Path], as_json: bool) -> None:
 
 
 def _problems_of(path: Path) -> tuple[Sequence[str], list[SessionProblem], str]:
-    """Return the names of a session's views, what is wrong with them, and why it cannot be read, or ""."""
+    """Return names of a session's views, the problems found, and an error line if it cannot be read, else "".
+
+    A wrong length unit is found while reading; it counts as a problem.
+    """
     from stitch.screening.deep_check import deep_check
     from stitch.screening.problems import SessionProblem
     from stitch.session.reading.session_folder import load_session
@@ -103,7 +109,7 @@ def _problems_of(path: Path) -> tuple[Sequence[str], list[SessionProblem], str]:
 
 
 def _summary_rows(fact: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the same for people: words for keys, lengths with their unit."""
+    """Return rows (name, text) of what `session_summary` returns, for people; rows without text are left out."""
     carried = "the scanner" if fact["mount"] == "eye_in_hand" else "the part"
     unit, far = fact["length_unit"], fact["median_range"]
     rows = [

@@ -42,7 +42,10 @@ class Commands(Mapping[str, Any]):
     """Name to command, loaded at first use."""
 
     def __init__(self) -> None:
-        """List the commands of the core and of installed packages, the usual ones first; a package may replace one."""
+        """List the commands of the core and of installed packages, in `_ORDER`, then by name.
+
+        A package that offers a command of the same name replaces it.
+        """
         core = [EntryPoint(name, place, GROUP) for name, place in _CORE_COMMANDS.items()]
         entries = {entry.name: entry for entry in (*core, *entry_points(group=GROUP))}
         first = [name for name in _ORDER if name in entries]
@@ -59,13 +62,19 @@ class Commands(Mapping[str, Any]):
         return len(self._entries)
 
     def unloaded(self) -> dict[str, TyperCommand]:
-        """Return all by name with what they are for, as a list shows them; only what does not say so is loaded."""
+        """Return all commands by name with their help text alone, for the list of commands.
+
+        The text is read from the source; a command is loaded only if it is not found there.
+        """
         texts = {name: command_help(entry) for name, entry in self._entries.items()}
         return {name: TyperCommand(name, help=text) if text else self[name] for name, text in texts.items()}
 
 
 def _load_command(entry: EntryPoint) -> Any:
-    """Return the command behind an entry; a `typer.Typer` is a group of commands."""
+    """Return the click command of an entry point, a function or a `typer.Typer`, which is a group of commands.
+
+    Commands of the core print nothing but their result on standard output; those of packages do as they like.
+    """
     loaded = entry.load()
     if isinstance(loaded, typer.Typer):
         group = loaded
@@ -79,10 +88,13 @@ def _load_command(entry: EntryPoint) -> Any:
 
 
 class Command(TyperCommand):
-    """A command of which an option with brackets about its values, as --mesh [watertight|light], may stand alone."""
+    """A command with options whose value may be left out: those with a metavar in brackets, --mesh [watertight|light].
+
+    Such an option without one of these values means `open`.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Give an option that stands alone the value `open`: what follows it is not its own."""
+        """Parse the command line, with =open appended to such an option where none of its values follows."""
         values = {
             name: metavar[1:-1].split("|")
             for option in self.params
@@ -103,7 +115,7 @@ class CommandGroup(TyperGroup):
         self.commands: Any = Commands()
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands, without waiting for the libraries of all."""
+        """Write the list of commands without loading them, which would take long."""
         loaded, self.commands = self.commands, self.commands.unloaded()
         try:
             super().format_help(ctx, formatter)
@@ -111,7 +123,7 @@ class CommandGroup(TyperGroup):
             self.commands = loaded
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Complete names alone: whoever presses the tab key does not wait for the libraries of all commands."""
+        """Return completions of a command's name without loading the commands: the tab key has to answer at once."""
         loaded, self.commands = self.commands, {name: TyperCommand(name) for name in self.commands}
         try:
             return super().shell_complete(ctx, incomplete)
@@ -120,11 +132,14 @@ class CommandGroup(TyperGroup):
 
 
 def command_help(entry: EntryPoint) -> str | None:
-    """Return the docstring of the function behind an entry, or the `help` of a group of commands; else None."""
+    """Return the help text of a command from its source, without importing it; None where none is found.
+
+    That is the docstring of the function, or the argument `help` of a `typer.Typer(...)` that is assigned.
+    """
     try:
         source = _module_source(entry.module)
         if (start := source.find(f"\ndef {entry.attr}(")) >= 0:
-            # The function alone: the modules of all commands take a quarter of what their list does.
+            # Two blank lines end the function. To parse whole modules would take a quarter of the time of the list.
             source = source[start:].partition("\n\n\n")[0]
         nodes = ast.parse(source).body
     except (OSError, SyntaxError, ValueError):
@@ -140,7 +155,7 @@ def command_help(entry: EntryPoint) -> str | None:
 
 
 def _module_source(module: str) -> str:
-    """Return the source of a module; the packages above it are not imported."""
+    """Return the source of a module inside a package, found without importing either; "" where there is none."""
     top, *inner = module.split(".")
     spec = find_spec(top)
     for folder in (spec.submodule_search_locations or ()) if spec else ():

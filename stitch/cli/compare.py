@@ -62,7 +62,11 @@ def compare_run(
 
 
 def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
-    """Let another program register the scans of a run, write witness.json with a picture, and print what differs."""
+    """Register the scans of a run with another program, print how its poses differ, and write witness.json.
+
+    Raises:
+        InputError: the program is not known, or not installed.
+    """
     from stitch.numerics.units import angle_text, length_text
     from stitch.output import json_file, run_folder
     from stitch.output.comparison.open3d_witness import open3d_witness
@@ -92,7 +96,7 @@ def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: 
 
 
 def write_comparison(state: RunData, run: Path) -> ResidualTables:
-    """Return the comparison of a run, after compare.json and what other packages make of it are written."""
+    """Return the tables of residuals of a run, after writing compare.json and the pages of installed packages."""
     from stitch.output import json_file, run_folder
     from stitch.output.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
 
@@ -105,7 +109,14 @@ def write_comparison(state: RunData, run: Path) -> ResidualTables:
 
 
 def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> None:
-    """Print what follows something, the worst views and places, and the clearest tables."""
+    """Print what the residuals depend on, the worst views and places, and the `_LISTED_TABLES` clearest tables.
+
+    Tables come in groups whose bins hold the same correspondences, the clearest first.
+
+    Args:
+        state: the run that was compared.
+        run: its folder.
+    """
     from stitch.numerics.units import MICROMETRES, length_text
 
     unit = state.session.length_unit
@@ -125,7 +136,12 @@ def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> No
 
 
 def _show_followed(followed: Sequence[Dependence], to_um: float) -> None:
-    """Print what whole views follow, and their trend along the clearest covariate."""
+    """Print on which covariates the displacement of whole views depends, and its means along the clearest one.
+
+    Args:
+        followed: trends along covariates, the clearest first.
+        to_um: micrometres per length_unit.
+    """
     from stitch.diagnosis.dependence import also_clear, equally_clear
 
     if not followed:
@@ -161,7 +177,7 @@ def _followed_text(x: Dependence) -> str:
 
 
 def _significance_sentence(comparison: ResidualTables) -> str:
-    """Return what the means of all bins say together; views are the samples."""
+    """Return a sentence on which means of bins differ from zero, with p-values over all bins of all tables."""
     from stitch.output.comparison.residual_tables import CLEAR
 
     if not comparison.groups:
@@ -184,7 +200,7 @@ def _group_chance(comparison: ResidualTables, group: Sequence[ResidualTable]) ->
 
 
 def _chance_text(comparison: ResidualTables, table: ResidualTable) -> str:
-    """Return how easily chance makes any of all means as clear as the clearest of a table."""
+    """Return as text the probability that by chance any mean of all tables is as clear as this table's clearest."""
     p = comparison.p_of_all(table)
     return "p < 0.0001" if p < 1e-4 else f"p = {p:.2g}"
 
@@ -196,7 +212,13 @@ def _group_names(group: Sequence[ResidualTable]) -> str:
 
 
 def _worst_rows(table: ResidualTable, state: RunData, to_um: float) -> str:
-    """Return the worst rows of a table with their rms; of places, in which unit and frame they are written."""
+    """Return the `_WORST_ROWS` rows of a table with the largest rms, in µm, as text.
+
+    Labels of the table of places are coordinates: their unit and frame are added.
+
+    Args:
+        to_um: micrometres per length_unit.
+    """
     from stitch.output.comparison.residual_tables import PLACE
 
     worst = ", ".join(
@@ -211,7 +233,11 @@ def _worst_rows(table: ResidualTable, state: RunData, to_um: float) -> str:
 
 
 def _show_group(group: Sequence[ResidualTable], comparison: ResidualTables, to_um: float) -> None:
-    """Print one table for all properties whose bins hold the same, with the edges of the first."""
+    """Print one table for a group of tables whose bins hold the same correspondences, with the edges of the first.
+
+    Args:
+        to_um: micrometres per length_unit.
+    """
     table = group[0]
     unit = f" ({table.unit})" if table.unit else ""
     has = "has" if len(group) == 2 else "have"

@@ -58,7 +58,7 @@ def diagnose_run(
 
 
 def _diagnose_together(runs: Sequence[Path], effects_file: Path | None, trust: bool, as_json: bool) -> None:
-    """Print what several sessions of one arm decide together."""
+    """Diagnose the runs of several sessions of one arm together, and print which effect of the arm is missing."""
     from stitch.diagnosis.diagnose import linear_model_of
     from stitch.diagnosis.together import decide_together, together_document, together_sentence
     from stitch.output.json_file import to_json
@@ -81,7 +81,7 @@ def _diagnose_together(runs: Sequence[Path], effects_file: Path | None, trust: b
 
 
 def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:
-    """Return the diagnosis of a run folder and its document, after both are written there."""
+    """Return the diagnosis of a run folder and diagnosis.json as a dictionary, after writing it there."""
     from stitch.api.pipeline import diagnose
     from stitch.output.run_folder import preload_entry_points
 
@@ -93,7 +93,10 @@ def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[
 
 
 def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str, Any]:
-    """Return the diagnosis as a document, after diagnosis.json and what other packages make of it are written."""
+    """Return diagnosis.json as a dictionary, after writing it and the pages of installed packages.
+
+    Its entry `of` identifies the run and the version of stitch, to know later whether it is still valid.
+    """
     from stitch.output import json_file, run_folder, stored_run
     from stitch.output.diagnosis_document import diagnosis_document
 
@@ -105,7 +108,10 @@ def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str
 
 
 def show_diagnosis(diagnosis: Diagnosis) -> None:
-    """Print the finding for everybody, the evidence, the likeliest effects, and where the error comes from."""
+    """Print a diagnosis: the finding in plain words, the evidence, a table of the likeliest effects, and details.
+
+    Where only headlines are printed, the finding and the table alone.
+    """
     from stitch.diagnosis.sentences import posterior_text
     from stitch.numerics.units import length_text
     from stitch.output.plain_finding import open_doubts, plain_finding
@@ -116,6 +122,7 @@ def show_diagnosis(diagnosis: Diagnosis) -> None:
     posterior = partial(posterior_text, diagnosis.verdict, diagnosis.effects, posteriors)
 
     def rms_if_added(candidate: CandidateEffect, heldout: bool) -> str:
+        """Return the rms predicted with an effect, on views left out or in the fit; a dash where unknown."""
         if not candidate.ranked.score.observable or candidate.cross_validation is None:
             return "–"
         return length_text(diagnosis.rms_if_added(candidate.cross_validation)[heldout], length_unit, zeros=True)
@@ -139,7 +146,12 @@ def show_diagnosis(diagnosis: Diagnosis) -> None:
 
 
 def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], length_unit: str) -> None:
-    """Print sizes and aliases of effects, the sources of the error, what was not tested, and what to measure next."""
+    """Print the details below the table of a diagnosis: sizes, sources of the error, untested effects, proposals.
+
+    Args:
+        listed: the effects in the table. Their aliases are effects that look alike in these views, with correlation.
+        length_unit: "mm" or "m".
+    """
     from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
     from stitch.model.model import uncertainty_scope
     from stitch.output.finding_screen import unseen_text, untested_text
@@ -170,7 +182,7 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
 
 
 def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
-    """Print source, share of the variance and size (rms) of all that the poses leave; nothing without a budget."""
+    """Print the sources of the error of whole views, with shares of its variance and rms; nothing without a budget."""
     from stitch.numerics.units import length_text
     from stitch.output.plain_finding import largest_error_sources, share_text
 
@@ -183,7 +195,7 @@ def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
 
 
 def _show_missed(diagnosis: Diagnosis, length_unit: str) -> None:
-    """Print what effects too small to be seen could still do to the hand-eye."""
+    """Print the three largest errors of the hand-eye, at the part, from effects too small for these views to show."""
     from stitch.numerics.units import length_text
 
     known = sorted(((c.hand_eye, c.name) for c in diagnosis.candidates if c.hand_eye is not None), reverse=True)

@@ -57,7 +57,10 @@ def parameter_signature(effect: Effect) -> str:
 
 
 def _document(effect: Effect) -> dict[str, Any]:
-    """Return an effect as JSON has it: place, formula, parameters with units and plausible sizes, and what it needs."""
+    """Return an effect as JSON: place, formula, parameters with units and plausible sizes, and the data it needs.
+
+    A twist has rotations and translations: its `unit` and `plausible` are those of the former, `…_shift` the latter's.
+    """
     return {
         "effect": effect.name,
         "place": effect.place,
@@ -80,10 +83,10 @@ def _document(effect: Effect) -> dict[str, Any]:
 
 
 def _show_effect(effect: Effect) -> None:
-    """Print an effect: its place and formula, a line for each parameter with its plausible size, and what it needs."""
-
+    """Print an effect: place and formula, a line per parameter with its plausible size, and the data it needs."""
     from stitch.effects.contract import PLACES
 
+    # How many numbers a parameter stands for, by its kind.
     kinds = {
         "number": "",
         "vector": ", x, y, z",

@@ -63,7 +63,11 @@ def _options(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; errors of the input or the computation end in one line and their exit code."""
+    """Run the command line; an error ends in one line and an exit code: 2 for wrong input, 1 for anything else.
+
+    Args:
+        arguments: words after the program's name; None: those of this process, which then ends.
+    """
     # Before a library is loaded that has threads of its own: one that comes later would fight ours for the cores.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -107,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _exit_with_message(message: str, code: int) -> None:
-    """Print one line on standard error and end the process."""
+    """Print a message as one line of printable characters on standard error, and end the process with a code."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     line = f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}"
     if sys.stderr.isatty():
@@ -121,7 +125,7 @@ def _exit_with_message(message: str, code: int) -> None:
 
 
 def _unexpected_message(error: Exception) -> str:
-    """Return a fault of the program in one line; the environment variable STITCH_TRACEBACK shows all of it."""
+    """Return an error that nothing caught as one line; with STITCH_TRACEBACK set, the traceback is printed too."""
     if os.environ.get("STITCH_TRACEBACK"):
         traceback.print_exception(error)
     last = traceback.extract_tb(error.__traceback__)[-1]

@@ -60,7 +60,11 @@ def next_measurement(
 
 
 def next_view_row(document: dict[str, Any]) -> dict[str, Any]:
-    """Return what `next --json` says of the views that decide: poses, rivals, what each expects in the first, odds."""
+    """Return entries of `next --json`: the proposed poses, the effects they separate, and how probably they decide.
+
+    Args:
+        document: diagnosis.json. Its proposals are poses (`joints_deg` is not null) or reference objects to measure.
+    """
     poses = [row for row in document["next"] if row["joints_deg"] is not None]
     deciding = (document.get("screen") or {}).get("deciding_view") or {}
     keys = ("joints_deg", "T_base_flange", "wait_s", "probability")
@@ -74,7 +78,11 @@ def next_view_row(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
-    """Write a robot program that drives to the proposed views.
+    """Write a robot program that drives to the proposed views, by an installed package.
+
+    Args:
+        output: file of the program, whose ending says for which controller.
+        j3: of FANUC: "own", or "j2+j3" where joint 3 of the session is the sum; None: not stated.
 
     Raises:
         InputError: no pose is proposed, or no program of this kind can be written.
@@ -93,6 +101,7 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
     writer = next(iter(entry_points(group="stitch.next_programs")), None)
     if writer is None:
         raise InputError(f"{output}: programs are written by stitch's export plug-in; to fix: install stitch anew")
+    # Programs are in mm.
     T_base_flange = np.array([proposal.T_base_flange for proposal in poses])
     T_base_flange[:, :3, 3] *= METRES[diagnosis.linear.measurement.length_unit] * 1e3
     about = (
@@ -111,7 +120,13 @@ def proposed_poses(diagnosis: Diagnosis) -> list[Proposal]:
 
 
 def show_next_views(diagnosis: Diagnosis, document: dict[str, Any]) -> None:
-    """Print the views that decide, their odds, what each rival expects in the first, and artefacts."""
+    """Print the proposals of a diagnosis: views that decide, with their probability, and reference objects to measure.
+
+    Without any proposal, the reason is printed.
+
+    Args:
+        document: diagnosis.json.
+    """
     poses = proposed_poses(diagnosis)
     if poses and poses[0].separates:
         _show_deciding(diagnosis, poses, document)
@@ -124,12 +139,12 @@ def show_next_views(diagnosis: Diagnosis, document: dict[str, Any]) -> None:
 
 
 def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[str, Any]) -> None:
-    """Print the views that decide between effects, with the odds, and by how much each effect would move the first one.
+    """Print the views that decide between effects, with the probability that they do, and what each effect predicts.
 
     Args:
-        document: diagnosis.json, which holds what is expected of the first view.
+        poses: the proposed views; `probability` is that of deciding with this view and those before it.
+        document: diagnosis.json, which holds what each effect predicts for the first view.
     """
-
     from stitch.diagnosis.next_view import NOT_IN_ODDS, deciding_words
     from stitch.numerics.units import angle_text, length_text
 
@@ -157,8 +172,7 @@ def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[s
 
 
 def _why_nothing(diagnosis: Diagnosis) -> str:
-    """Return why no view is proposed, in a sentence."""
-
+    """Return a sentence, by the verdict, on why nothing is proposed."""
     from stitch.diagnosis.thresholds import ALIAS_CORRELATION
 
     effects = diagnosis.effects

@@ -26,7 +26,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone 
 
 
 def complete_effect(incomplete: str) -> list[str]:
-    """Return how a name of an effect may go on, the last of a list with commas, for the tab key of a shell."""
+    """Return completions for the tab key of a shell: the text with its last, unfinished name of an effect completed."""
     from stitch.effects.contract import EFFECTS
 
     before, comma, begun = incomplete.rpartition(",")
@@ -44,10 +44,10 @@ def split_names(text: str | None) -> tuple[str, ...]:
 
 
 def require_new(file: Path | None) -> None:
-    """Refuse to write over a file, or into a folder that there is not; a link counts, wherever it leads.
+    """Refuse a file that exists, also as a link that leads nowhere, or whose folder does not exist; None passes.
 
     Raises:
-        InputError: there is one, or no folder.
+        InputError: says which of the two.
     """
     if file is not None and (file.exists() or file.is_symlink()):
         raise InputError(f"{file}: exists already; to fix: name another file, or remove it")
@@ -56,17 +56,20 @@ def require_new(file: Path | None) -> None:
 
 
 def require_tolerance(tolerance: float | None) -> None:
-    """Refuse what is no length.
+    """Refuse a tolerance, in length_unit, that is not positive and finite; None, not stated, passes.
 
     Raises:
-        InputError: zero, negative or not finite.
+        InputError: it is such a number.
     """
     if tolerance is not None and not 0 < tolerance < float("inf"):
         raise InputError(f"--tolerance {tolerance:g}: to fix: give a length above zero, in the session's length_unit")
 
 
 def bytes_of(size: str | None, option: str = "--memory") -> float | None:
-    """Return the bytes of a size as people write it, None for none.
+    """Return a size such as 2GB in bytes, with decimal units (1 KB = 1000 bytes); None for None.
+
+    Args:
+        option: name of the option, for the message.
 
     Raises:
         InputError: not a size.

@@ -30,7 +30,7 @@ PROGRESS_VARIABLE = "STITCH_PROGRESS"  # json: lines for programs; off: none on 
 
 @contextmanager
 def show_activity(text: str) -> Iterator[None]:
-    """Say what the block does, and for how long, wherever nothing more precise is said."""
+    """Show a text and the time since it began while the block lasts, until a loop inside shows something else."""
     live_line().begin(text)
     try:
         yield
@@ -40,10 +40,12 @@ def show_activity(text: str) -> Iterator[None]:
 
 @contextmanager
 def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str) -> Iterator[RunData]:
-    """Hold a run folder as its only writer while the block lasts, and give the run that wrote it.
+    """Yield the run of a folder; no other process may write into the folder while the block lasts.
 
     Args:
-        activity: what is said while it is read.
+        effects_file: Python file of effects, in place of the one that the model names.
+        trust: run the file that the model names.
+        activity: text that is shown while it is read.
     """
     from stitch.output import run_folder, stored_run
 
@@ -54,8 +56,11 @@ def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str)
 
 
 def recorder_for(folder: Path, recording: bool, earlier: Path | None = None) -> Recorder:
-    """Return progress on a terminal or as lines, and the recording, which goes on where that of an earlier folder
-    ends."""
+    """Return a recorder that shows progress and, if asked for, writes recording.rrd into a folder.
+
+    Args:
+        earlier: run folder whose recording is copied first, so that the new one continues it; None: it begins anew.
+    """
     from stitch.output.run_folder import recordings
     from stitch.recorder import RecorderGroup
 
@@ -72,9 +77,10 @@ def live_line() -> LiveLine:
 
 
 class LiveLine:
-    """A line on standard error that begins with the first text; as text its step, and for how long the work has lasted.
+    """A changing line on standard error: the present step and the time since the command began.
 
-    How many iterations there will be nobody knows.
+    On anything but a terminal, plain lines take its place. No share is shown, since nobody knows the number of
+    iterations beforehand. Rich draws the object itself again and again, in a thread of its own, so that the time runs.
     """
 
     def __init__(self) -> None:
@@ -96,20 +102,25 @@ class LiveLine:
         return Text(str(self))
 
     def begin(self, step: str, detail: str = "") -> None:
-        """Show a step with the time since the first of all, until `stop`; loops stand in its place meanwhile."""
+        """Show a step with the running time until `stop`; a loop shown by `say` stands in its place meanwhile."""
         self._step, self._detail = step, detail
         self._runs = True
         self.say(self, step)
 
     def loops_ended(self) -> None:
-        """Show the step that stood before the loops; nothing if there was none."""
+        """Show again the step that stood before a loop began; clear the line if there was none."""
         if self._runs:
             self.say(self, self._step)
         else:
             self.stop()
 
     def say(self, text: object, step: str) -> None:
-        """Show a text of a step in place of the last."""
+        """Show a text in place of the last one.
+
+        Args:
+            text: a string, or an object that is drawn as text anew each time.
+            step: name of the step to which the text belongs: without a terminal each step is printed on its own line.
+        """
         if not sys.stderr.isatty():
             if not os.environ.get(PROGRESS_VARIABLE):
                 self._plain.show(step, text)
@@ -127,7 +138,7 @@ class LiveLine:
         self._status.update(text)
 
     def stop(self) -> None:
-        """Clear the line; the next text begins it anew."""
+        """Clear the line; the next text shows it again."""
         self._runs = False
         self._plain.stop()
         if self._status is not None and self._visible:
@@ -136,7 +147,10 @@ class LiveLine:
 
 
 class _PlainLines:
-    """A line for each step on what is no terminal, once the work has lasted a while."""
+    """Prints a line for each step where there is no terminal; none in the first `QUIET` seconds of the work.
+
+    A timer's thread prints the first line, the thread that works all others.
+    """
 
     def __init__(self) -> None:
         self._timer: threading.Timer | None = None
@@ -144,7 +158,10 @@ class _PlainLines:
         self._printed: dict[str, float] = {}  # when each step was printed
 
     def show(self, step: str, text: object) -> None:
-        """Print a step as it begins, and again after a while; nothing while the work may soon be over."""
+        """Print a step when it begins, and again if the last line is `AGAIN` seconds old.
+
+        The first call starts the timer; until it prints, nothing is printed: the work may soon be over.
+        """
         self._step, self._text = step, text
         if self._timer is None:
             self._timer = threading.Timer(QUIET, self._print)
@@ -165,14 +182,23 @@ class _PlainLines:
 
 
 class TimeLeft:
-    """Watches loops, and loops within them: sessions: 2 of 5, 1:07 left; scans: 12 of 40, 0:07 left."""
+    """Shows the time left of loops and of loops within them, as in "sessions: 2 of 5, 1:07 left; scans: …".
+
+    It is called by the loops themselves (`stitch.system.threads`).
+    """
 
     def __init__(self) -> None:
         self._started: dict[str, float] = {}  # by label, the outermost first
         self._texts: dict[str, str] = {}
 
     def __call__(self, label: str, done: int, total: int) -> None:
-        """Show that a step of a loop begins, or work that is no loop; clear the loop after its last step."""
+        """Show how far a loop is.
+
+        Args:
+            label: name of the loop.
+            done: number of steps that are done; 0 begins the loop, `total` ends it.
+            total: number of steps; 0: no loop, the label alone is shown.
+        """
         if total == 0:
             live_line().begin(label)
             return
@@ -192,7 +218,11 @@ class TimeLeft:
 
 
 def time_left_text(label: str, done: int, total: int, seconds: float) -> str | None:
-    """Return what to say after so many seconds; None while it is too early to know."""
+    """Return the text of a loop with its time left, extrapolated from the steps done; None in its first second.
+
+    Args:
+        seconds: since the loop began.
+    """
     if seconds < _SOON or not 0 < done < total:
         return None
     left = round(seconds / done * (total - done))
@@ -200,9 +230,9 @@ def time_left_text(label: str, done: int, total: int, seconds: float) -> str | N
 
 
 class Progress:
-    """A recorder that moves the changing line, and prints lines for the program that asks for them.
+    """A recorder that shows the stage and iteration of a run in the changing line.
 
-    Such a line says where the work stands: {"progress": "fit", "iteration": 3, "rms_um": 32.7}.
+    With STITCH_PROGRESS=json it prints JSON for programs too: {"progress": "fit", "iteration": 3, "rms_um": 32.7}.
     """
 
     def __init__(self) -> None:
@@ -211,7 +241,7 @@ class Progress:
         self._prints_lines = os.environ.get(PROGRESS_VARIABLE) == "json"
 
     def start(self, session: SessionData) -> None:
-        """Name what is being done."""
+        """Show that a session's hand-eye is being searched, and take over its length unit."""
         from stitch.numerics.units import MICROMETRES
 
         self._unit = session.length_unit
@@ -220,7 +250,7 @@ class Progress:
         self._print(progress="start", session=session.name, views=len(session.views))
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Show where the iteration stands; the first is 1."""
+        """Show an iteration, counted from 1 for people, with its rms and its gate (both length_unit; NaN: no gate)."""
         from stitch.numerics.units import length_text
 
         # Labelled points have their partners by name.
@@ -229,11 +259,11 @@ class Progress:
         self._print(progress=stage, iteration=index + 1, rms_um=rms * self._to_um)
 
     def stage(self, result: StageResult, poses: Array) -> None:
-        """A stage has ended."""
+        """Print that a stage has ended, for programs."""
         self._print(progress=result.name, ended=True, rms_um=result.rms * self._to_um)
 
     def finish(self, run: RunData) -> None:
-        """What follows takes its time too: recording and page are written next."""
+        """Show that cloud and page are being written: that takes seconds after the run itself."""
         live_line().begin(f"{run.session.name}: writing cloud and page")
         residual, heldout = run.residual_rms * self._to_um, run.heldout_rms * self._to_um
         self._print(progress="writing", residual_um=residual, heldout_um=heldout)

@@ -83,7 +83,12 @@ def printing_browser() -> str:
 
 
 def print_page(browser: str, page: Path, path: Path) -> None:
-    """Print `page` to `path`, whole or not at all.
+    """Write the PDF of an HTML page, completely or not at all.
+
+    Args:
+        browser: path of a Chromium browser.
+        page: HTML file.
+        path: PDF file to write.
 
     Raises:
         NoResultError: the browser did not print.
@@ -110,7 +115,12 @@ def print_page(browser: str, page: Path, path: Path) -> None:
 def _write_run_page(
     run: Path, with_diagnosis: bool, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
-    """Return the page of a run, written anew."""
+    """Write report.html of a run folder again, and return its path.
+
+    Args:
+        with_diagnosis: also compare and diagnose, unless the page already shows a diagnosis of this very model.
+        tolerance: within which the views have to agree on the part, length_unit; None: not stated.
+    """
     from stitch.api import pipeline
     from stitch.cli.compare import write_comparison
     from stitch.cli.diagnose import write_diagnosis
@@ -138,7 +148,15 @@ def _write_run_page(
 def _write_two_run_page(
     run: Path, other: Path, output: Path | None, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
-    """Return the page of what changed from one run to the other."""
+    """Write the page of what changed from the run `run` to the run `other`, and return its path.
+
+    Args:
+        output: file of the page; None: two-runs.html in the folder of `other`, which is then locked.
+        tolerance: within which the views have to agree on the part, length_unit; None: not stated.
+
+    Raises:
+        InputError: both are one run, or `output` is no place for a page.
+    """
     from stitch.output import run_folder, stored_run
     from stitch.output.comparison.two_runs import compare_runs, comparison_sentence
 

@@ -168,7 +168,11 @@ def run(
 def _require_known(
     mesh: str | None, tolerance: float | None, effects: list[str], effects_file: Path | None, register: str | None
 ) -> None:
-    """Refuse what cannot be meant, or lacks a package, before anything is read; load only what was asked for."""
+    """Refuse unknown values of options, and a mesh whose package is missing, before any scan is read.
+
+    Effects of the user's file are loaded here, since names of effects are checked against them. A library is imported
+    only if its option is used.
+    """
     if mesh is not None:
         from stitch.output.mesh import KINDS, OPEN
         from stitch.system.open3d_library import import_open3d
@@ -194,10 +198,12 @@ def _require_known(
 
 
 def _follow_session(folder: Path, views: int | None) -> None:
-    """Judge views as they come, until so many are there or Ctrl-C is pressed.
+    """Print a verdict on each view as it arrives in a session folder, until enough are there or Ctrl-C is pressed.
+
+    The folder is read again every `_EVERY` seconds. What cannot be read may be half-written: it is tried again.
 
     Args:
-        views: how many to wait for; None: until Ctrl-C.
+        views: number of views to wait for; None: until Ctrl-C.
 
     Raises:
         InputError: session.toml is missing or wrong, or the poses are of another convention than it states.
@@ -242,14 +248,17 @@ def _follow_session(folder: Path, views: int | None) -> None:
 
 
 class _Failures:
-    """What cannot be read yet: said once, after some patience, since a file may be half-written."""
+    """Prints why reading fails, once for each reason, and only after `_PATIENCE` seconds of failures.
+
+    A new object is made after each success.
+    """
 
     def __init__(self) -> None:
         self._since: float | None = None
         self._said = ""
 
     def note(self, message: str) -> None:
-        """Remember that reading failed, and print why if it has failed for long."""
+        """Note one failure, and print the message if reading has failed for long and it was not printed last."""
         now = time.monotonic()
         self._since = self._since or now
         if now - self._since > _PATIENCE and message != self._said:
@@ -258,7 +267,7 @@ class _Failures:
 
 
 def _current_session() -> Path:
-    """Return the folder one stands in, if it is a session."""
+    """Return the present folder; InputError if it is no session folder."""
     if not Path("session.toml").is_file():
         raise InputError(
             "no session named, and this folder has no session.toml; to fix: name a session folder, go into one, or "
@@ -268,7 +277,14 @@ def _current_session() -> Path:
 
 
 def _load_sessions(paths: list[Path], memory: str | None) -> list[SessionData]:
-    """Return the sessions; refuse names that cannot be those of their folders in the folder of a rig."""
+    """Return the sessions of folders; the runs of several get folders with their names, which must be possible.
+
+    Args:
+        memory: size such as 2GB within which they have to stay all together; None: no limit.
+
+    Raises:
+        InputError: two of the same name, or the name of a file that a run writes.
+    """
     from stitch.output.json_file import FILES
     from stitch.session.reading.session_folder import load_session
 
@@ -288,7 +304,18 @@ def _load_sessions(paths: list[Path], memory: str | None) -> list[SessionData]:
 def _given_models(
     hand_eye: Path | None, arm: Path | None, effects: list[str], effects_file: Path | None, trust: bool
 ) -> tuple[ModelFile | None, ModelFile | None, str | None]:
-    """Return the model that is used as it is, the arm that is kept, and the file of the user's own effects, if any."""
+    """Return the model to use as it is, the arm to keep, and the path of the user's Python file of effects.
+
+    Each is None where none is given; at most one of model and arm is.
+
+    Args:
+        hand_eye: run whose model is used as it is.
+        arm: run whose effects of joints and links are kept.
+        effects: names of effects that are to be fitted.
+
+    Raises:
+        InputError: options that exclude each other, or an effect that the arm has already.
+    """
     if hand_eye and (effects or arm):
         raise InputError(
             f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
@@ -313,7 +340,13 @@ def _given_models(
 def _write_runs(
     runs: list[RunData], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
 ) -> list[str]:
-    """Write what was found, and return how each mesh lies to its cloud, in words."""
+    """Write the run folders, with meshes if asked for, and return a sentence on how well each mesh fits its cloud.
+
+    Args:
+        folders: one a run, inside the scratch folder; of several runs `scratch` gets the common model.toml.
+        mesh: "open", "watertight" or "light"; None: none is made.
+        tolerance: within which the views have to agree on the part, length_unit; None: not stated.
+    """
     from stitch.output.run_folder import write_model_with_effects, write_with_page
 
     fits = []
@@ -332,7 +365,7 @@ def _write_runs(
 
 
 def _show_runs(runs: list[RunData], tolerance: float | None) -> None:
-    """Print a report for each run; clouds of one rig have one hand-eye."""
+    """Print a report for each run; the hand-eye that clouds of several sessions share is printed once, at the end."""
     live_line().stop()
     each = not runs[0].session.has_clouds
     for result in runs:
@@ -340,7 +373,7 @@ def _show_runs(runs: list[RunData], tolerance: float | None) -> None:
 
 
 def _show_written(folders: list[Path], mesh_fits: list[str]) -> None:
-    """Print how the meshes lie to their clouds, the files of the runs, and the next command."""
+    """Print the sentences on meshes, the files of the run folders, and the next command."""
     for sentence in mesh_fits:
         say(sentence)
     for folder in folders if in_full() else ():
@@ -349,7 +382,12 @@ def _show_written(folders: list[Path], mesh_fits: list[str]) -> None:
 
 
 def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: bool = True) -> None:
-    """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
+    """Print the report of a run: headline, remedies, numbers in a block, hand-eye, notes; or only the main numbers.
+
+    Args:
+        tolerance: within which the views have to agree on the part, length_unit; None: not stated.
+        with_hand_eye: False where another report prints it.
+    """
     from stitch.output.comparison.model_history import model_history
     from stitch.output.comparison.run_verdict import run_headline
     from stitch.output.fit_report import axis_lines, report_rows, run_hand_eye_lines
@@ -382,7 +420,10 @@ def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: 
 
 
 def show_light(result: RunData, tolerance: float | None) -> None:
-    """Print whether the part is within a tolerance, as the page's light says it; nothing where none is stated."""
+    """Print whether the views agree on the part within a tolerance (length_unit), as the page's traffic light shows.
+
+    Nothing is printed where no tolerance is stated, or where the run cannot tell.
+    """
     from stitch.output.comparison.model_history import model_history
     from stitch.output.comparison.run_verdict import run_light
 

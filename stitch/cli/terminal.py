@@ -20,11 +20,11 @@ _briefly: list[bool] = []
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
-    """Print a line for people; a terminal that is too narrow gets it in several, none of which cuts a word or a number.
+    """Print a text for people, on a terminal broken into lines between words.
 
     Args:
         hang: columns by which all lines but the first are indented.
-        stream: where it goes; None is standard error, or standard output while a command `answers`.
+        stream: where it goes; None is standard error, or standard output inside the block `answers()`.
     """
     from stitch.system.lines import broken_lines, printable
     from stitch.system.process import answer_stream, console
@@ -36,7 +36,7 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
 
 @contextmanager
 def answers() -> Iterator[None]:
-    """While the block lasts, lines and tables for people are the result of a command: they go to standard output."""
+    """Send lines and tables for people to standard output while the block lasts, as the result of a command."""
     from stitch.system.process import answers_to
 
     with answers_to(results_stream):
@@ -44,7 +44,7 @@ def answers() -> Iterator[None]:
 
 
 def show_block(rows: Sequence[tuple[str, str]]) -> None:
-    """Print names and what belongs to each, aligned."""
+    """Print rows (name, text) with the texts aligned; a text of several lines is indented as a whole."""
     from rich.cells import cell_len
 
     longest = max((cell_len(name) for name, _ in rows), default=0)
@@ -61,9 +61,12 @@ def show_table(
     rows: Sequence[Sequence[str]],
     words: Sequence[str] | None = None,
 ) -> None:
-    """Print a table: columns of `words`, if not stated the first, to the left, numbers to the right.
+    """Print a table with aligned columns.
 
-    On a terminal that is too narrow every row is a line that names its cells.
+    On a terminal that is too narrow, each row becomes a line in which every cell follows its heading.
+
+    Args:
+        words: headings of the columns that are aligned to the left; all others to the right. None: the first column.
     """
     from rich.cells import cell_len
 
@@ -92,13 +95,18 @@ def show_columns(
     items: Iterable[Any],
     words: Sequence[str] | None = None,
 ) -> None:
-    """Print a table with a row an item: each column is its heading and what it says of an item."""
+    """Print a table with a row per item.
+
+    Args:
+        columns: (heading, function that returns the text of an item).
+        words: headings of the columns that are aligned to the left; None: the first column.
+    """
     headings = [heading for heading, _ in columns]
     show_table(title, headings, [[cell(item) for _, cell in columns] for item in items], words)
 
 
 def show_files(folder: Path, names: Sequence[str]) -> None:
-    """Print the paths of those files that there are."""
+    """Print the paths of those files in a folder that exist."""
     for name in names:
         if (folder / name).exists():
             say(f"  {folder / name}")
@@ -106,7 +114,7 @@ def show_files(folder: Path, names: Sequence[str]) -> None:
 
 @contextmanager
 def headlines_only() -> Iterator[None]:
-    """While the block lasts, commands print headlines and their main numbers: who calls them tells the rest."""
+    """Let commands print only headlines and main numbers while the block lasts: their caller prints the rest."""
     _briefly.append(True)
     try:
         yield
@@ -126,7 +134,7 @@ def show_next(line: str) -> None:
 
 
 def stdout_for_results(command: Command) -> Command:
-    """The command with standard output kept for `emit`."""
+    """Return a command that prints only what it `emit`s on standard output; all else goes to standard error."""
 
     @wraps(command)
     def apart(*arguments: Any, **options: Any) -> Any:
@@ -148,7 +156,10 @@ def emit(text: str) -> None:
 
 @contextmanager
 def _stdout_redirected() -> Iterator[None]:
-    """Give standard error what is printed while the block lasts, also by compiled libraries to descriptor 1."""
+    """Send to standard error what is printed while the block lasts; `emit` still reaches standard output.
+
+    Python prints to sys.stdout, compiled libraries to file descriptor 1: both are redirected.
+    """
     out = sys.stdout
     with _own_descriptor(out) as stream, redirect_stdout(sys.stderr):
         _results.append(stream)
@@ -160,7 +171,10 @@ def _stdout_redirected() -> Iterator[None]:
 
 @contextmanager
 def _own_descriptor(out: TextIO) -> Iterator[IO[str]]:
-    """A stream to where descriptor 1 led, which leads to 2 while the block lasts; `out` itself where it is another."""
+    """Yield a stream to the real standard output, while file descriptor 1 leads to that of standard error, 2.
+
+    If `out`, the present sys.stdout, does not use descriptor 1, as in tests, it is yielded itself.
+    """
     try:
         out.flush()
         is_descriptor = out.fileno() == 1
@@ -180,7 +194,7 @@ def _own_descriptor(out: TextIO) -> Iterator[IO[str]]:
 
 
 def speak_any_terminal() -> None:
-    """Spell what a terminal's encoding does not have: um for µm."""
+    """Let both standard streams replace characters that their encoding lacks: um for µm."""
     codecs.register_error("stitch-spell", _replace_unencodable)
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, ValueError):
@@ -189,7 +203,10 @@ def speak_any_terminal() -> None:
 
 
 def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
-    """Return plain letters for those that an encoding lacks, and where to go on (`codecs.register_error`)."""
+    """Return a replacement in ASCII for characters that an encoding lacks, and the index where encoding goes on.
+
+    It is a handler as `codecs.register_error` takes it.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     text = ""
