@@ -13,7 +13,7 @@ from stitch.effects.contract import (
     is_asked,
     missing_need,
     of_each_scanner,
-    one_by_one,
+    separable_groups,
     without_offset,
 )
 from stitch.effects.empirical import empirical_effects
@@ -128,11 +128,11 @@ def free_masks(term: Term) -> list[Mask]:
     """
     effect, parameters = term.effect, term.parameters
     if effect.tier == "empirical" and effect.place == "sensor":
-        groups = one_by_one(effect, parameters)
+        groups = separable_groups(effect, parameters)
     else:
         groups = by_joint(effect, parameters) or without_offset(effect, parameters)
         if groups and effect.place == "links" and len(effect.specs) > 1:
-            groups = groups + one_by_one(effect, parameters)
+            groups = groups + separable_groups(effect, parameters)
     free = ~term.gridded
     alone = [free & np.isin(np.arange(len(free)), group) for group in groups]
     return [keep for keep in (free, *(keep for keep in alone if (keep != free).any())) if keep.any()]

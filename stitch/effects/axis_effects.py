@@ -66,7 +66,14 @@ def axis_wobble(motion: AxisMotion, views: Views, A: Array, B: Array) -> AxisMot
 
 
 def _against(motion: AxisMotion, views: Views, A: Array, B: Array, sides: Sequence[int]) -> Array:
-    """Return (V, K, 6) twists that turn against the rotary axes once a turn."""
+    """Return twists (V, K, 6) in the axes' frames that turn once a turn against the part on a rotary axis.
+
+    Component sides[0] is A sin θ + B cos θ, sides[1] is A cos θ − B sin θ, θ the reading; zero for linear axes.
+
+    Args:
+        A, B: (R,) amplitudes of the R rotary axes, in the unit of those components.
+        sides: indices of two components of a twist across the axis.
+    """
     rotary = views.axes.rotary
     angle = motion.readings[:, rotary]
     error = np.zeros_like(motion.error)
@@ -97,7 +104,7 @@ def axis_backlash(motion: AxisMotion, views: Views, b: Array, c: Array) -> AxisM
 
 
 def _spread(values: Array, where: Mask) -> Array:
-    """Return (K,) with the values of some axes, zero for the others."""
+    """Return an array (K,) with `values` where the mask `where` (K,) is True, zero elsewhere."""
     out = np.zeros(len(where))
     out[where] = values
     return out

@@ -63,13 +63,13 @@ _WHERE_FROM = {
 
 @dataclass(frozen=True)
 class Spec:
-    """How an argument of the function becomes parameters."""
+    """Which parameters an argument of an effect's function stands for; lengths in mm, angles in rad."""
 
     kind: str  # number | vector | offset | joint | torque | moment | twist | rotary | linear | scanner
     unit: str
-    typical: float
-    limit: float
-    grid: tuple[float, ...] = ()
+    typical: float  # size that a real cell may well have; the prior's sigma
+    limit: float  # a larger value is not believed
+    grid: tuple[float, ...] = ()  # values that are tried one by one, in place of a fit; (): it is fitted
     unit_shift: str = ""  # of a twist's translation
     typical_shift: float = 0.0
     limit_shift: float = 0.0
@@ -77,61 +77,101 @@ class Spec:
 
 
 def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
-    """Return one number."""
+    """Return the spec of an argument that is one number.
+
+    Args:
+        unit: with mm and rad, as "rad/°C"; "1" without one.
+        typical: size that a real cell may well have: the prior's sigma.
+        limit: a larger value is not believed.
+        grid: values that are tried one by one; empty: it is fitted.
+    """
     return Spec("number", unit, typical, limit, tuple(grid))
 
 
 def vector(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
-    """Return an array, a vector (3,) cx, cy, cz for c unless `axes` says otherwise."""
+    """Return the spec of an argument that is a vector (3,): parameters cx, cy, cz for c.
+
+    Args:
+        unit, typical, limit: of each component, as for `number`.
+        axes: what follows the argument's name, one component each, where they are not x, y, z.
+    """
     return Spec("vector", unit, typical, limit, axes=tuple(axes))
 
 
 def offset(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
-    """Return an array, a vector cx, cy, cz for c unless `axes` says otherwise; it may be zero where the effect's others
-    are not."""
+    """Return the spec of a vector, as `vector`, that may well be zero where the effect's other parameters are not.
+
+    So the effect is also tried without it.
+    """
     return Spec("offset", unit, typical, limit, axes=tuple(axes))
 
 
 def event() -> Spec:
-    """Return the view from which on something is different; every view that can show it is tried, of a hundred some
-    fifty."""
+    """Return the spec of an event: the number, from 0, of the first view after it; possible views are tried in turn.
+
+    Of hundreds of views some fifty are tried.
+    """
     return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
 
 
 def temperature() -> Spec:
-    """Return the number in `TEMPERATURES` of what an effect follows; each temperature that was measured is tried."""
+    """Return the spec of the temperature that an effect follows: its index in `TEMPERATURES`.
+
+    Each temperature that was measured is tried.
+    """
     return Spec("number", "column", 1.0, float("inf"), EVERY_TEMPERATURE)
 
 
 def per_joint(unit: str, typical: float, limit: float) -> Spec:
-    """Return an array (n,) with one number a joint: `c` becomes c1 … cn."""
+    """Return the spec of an array (n,) with one number for each joint: c1 … cn for c; arguments as for `number`."""
     return Spec("joint", unit, typical, limit)
 
 
 def per_torque(unit: str, typical: float, limit: float) -> Spec:
-    """Return one number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
+    """Return the spec of an array (m,) with one number for each torque that bends a joint, as `Views.sag` takes it.
+
+    Of c with masses c1 … cn; without them c2_3 for joint 2 and link 3. Arguments as for `number`.
+    """
     return Spec("torque", unit, typical, limit)
 
 
 def per_axis(kind: str, unit: str, typical: float, limit: float, axes: Sequence[str] = ("",)) -> Spec:
-    """Return an array (K·a,) with a numbers for each of the K external axes of a kind, rotary or linear: Au_table."""
+    """Return the spec of an array (K·a,) with a numbers for each of the K external axes of a kind: Au_table for A.
+
+    Args:
+        kind: rotary | linear.
+        unit, typical, limit: of each number, as for `number`.
+        axes: a names that follow the argument's name.
+    """
     return Spec(kind, unit, typical, limit, axes=tuple(axes))
 
 
 def per_scanner(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
-    """Return an array (3·(K − 1),) with a vector for each of K scanners but the first: rx_right."""
+    """Return the spec of an array (3·(K − 1),) with a vector for each of K scanners but the first: rx_right for r.
+
+    The first has none: its place is the model's hand-eye.
+    """
     return Spec("scanner", unit, typical, limit, axes=tuple(axes))
 
 
 def per_moment(unit: str, typical: float, limit: float) -> Spec:
-    """Return one number for each moment at the base that `Views.tilt` knows: c_x, c_y with masses, c_x_2 … without."""
+    """Return the spec of an array (k,) with one number for each moment that tilts the base, as `Views.tilt` takes it.
+
+    Of c with masses c_x, c_y; without them c_x_2 for link 2. Arguments as for `number`.
+    """
     return Spec("moment", unit, typical, limit)
 
 
 def twist(
     unit: str, rotation: float, translation: float, limit_rotation: float = 0.02, limit_translation: float = 10.0
 ) -> Spec:
-    """Return a twist (6,), rotation first, named rx … tz; `unit` follows rad and mm, such as "/h"."""
+    """Return the spec of an argument that is a twist (6,): parameters rx, ry, rz, tx, ty, tz.
+
+    Args:
+        unit: follows rad and mm, such as "/h"; empty for a plain twist.
+        rotation, translation: typical sizes, rad and mm.
+        limit_rotation, limit_translation: larger values are not believed, rad and mm.
+    """
     return Spec(
         "twist",
         f"rad{unit}",
@@ -165,14 +205,14 @@ class Parameter:
 
     @property
     def formatted(self) -> Amount:
-        """As people read it; the view of an event, and a temperature, by its name."""
+        """The value as people read it, with its sigma if it was fitted; a view or a temperature by its name."""
         if self.view:
             return Amount(self.view, "–", "")
         return format_amount(self.value, self.sigma if self.fitted else None, self.unit)
 
     @property
     def view(self) -> str:
-        """Name of the first view after an event, or of a temperature; empty where it is the number of neither."""
+        """Name of the view or temperature whose number the value is, the first view after an event; else empty."""
         number = int(np.ceil(self.value))
         return self.names[number] if 0 <= number < len(self.names) else ""
 
@@ -187,7 +227,7 @@ class Parameter:
         return bool(np.isfinite(self.sigma))
 
     def beyond_belief(self, value: float, sigma: float) -> bool:
-        """Return whether a value is clearly larger than is believed of the parameter."""
+        """Return True if a value is, by two sigmas, above what is believed: the limit, or 10 times the typical size."""
         return abs(value) - 2 * sigma > min(BELIEVABLE_SIZES * self.typical, self.limit)
 
     @property
@@ -208,13 +248,13 @@ class Effect:
     place: str
     specs: dict[str, Spec]
     function: Callable[..., Any]
-    needs: tuple[str, ...]  # joints, torque, velocity, intensity, or the name of a covariate
-    prefers: tuple[str, ...]  # covariates used where present
+    needs: tuple[str, ...]  # inputs without which it is left out: keys of `_WHERE_FROM`, or names of covariates
+    prefers: tuple[str, ...]  # covariates that it uses where the views have them; else it counts per hour
     tier: str  # physical | empirical | user | geometry: in every model of a session that has it, and no candidate
     group: str = ""  # covariate that an empirical effect follows
-    prior: float = 1.0  # how often it is met, beside an effect that every arm, mount or part may have
+    prior: float = 1.0  # prior odds relative to an effect that every arm, mount or part may have
     origin: str = ""  # of a user's: the file that it was loaded from, or `package …`; empty for one of this program
-    scanner: str = ""  # of several the one that has it, as its name says after an @; empty: all
+    scanner: str = ""  # the only scanner that has it, of several; empty: all
 
     @property
     def formula(self) -> str:
@@ -223,7 +263,7 @@ class Effect:
         return (function.__doc__ or "").strip().splitlines()[0]
 
     def at_scanner(self, scanner: str) -> "Effect":
-        """Return the same effect of one scanner among several, named EFFECT@SCANNER."""
+        """Return the effect as one of a single scanner among several, named EFFECT@SCANNER: nothing in other views."""
         function = _AtScanner(self.function, self.place, scanner)
         return replace(self, name=f"{self.name}@{scanner}", function=function, scanner=scanner)
 
@@ -236,14 +276,17 @@ class Effect:
         moments: Sequence[str] = (),
         scanners: Sequence[str] = (),
     ) -> tuple[Parameter, ...]:
-        """Return all parameters for an arm of n joints at zero, in the session's unit.
+        """Return all parameters of the effect in a cell, at value 0, in the session's length unit.
 
         Args:
-            torques: names of those that bend its joints.
-            moments: names of those that tilt its base.
-            scanners: names of all.
+            joints: number of the arm's joints.
+            torques: names of the torques that bend its joints.
+            length_unit: of the session.
+            axes: external axes.
+            moments: names of the moments that tilt its base.
+            scanners: names of all scanners; () of a single one.
         """
-        # The first scanner's place is the hand-eye.
+        # The first scanner's place is the hand-eye: it has no parameters.
         things = {kind: [axis.name for axis in axes if axis.kind == kind] for kind in KINDS} | {"scanner": scanners[1:]}
         named = [
             (key, spec, name)
@@ -257,7 +300,10 @@ class Effect:
         return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
 
     def arguments(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
-        """Return keyword arguments of the function: a number, or an array for an argument of several parameters."""
+        """Return the keyword arguments of the effect's function, from all of its parameters in their order.
+
+        A number for an argument of kind `number`, an array for any other.
+        """
         values: dict[str, list[float]] = {key: [] for key in self.specs}
         for p in parameters:
             values[p.argument].append(p.value)
@@ -266,7 +312,14 @@ class Effect:
 
 
 def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
-    """Return the names of the parameters that an argument stands for."""
+    """Return the names of the parameters that an argument stands for; not of axes and scanners, which have names.
+
+    Args:
+        key: the argument.
+        spec: of the argument.
+        joints: number of joints.
+        torques: names of torques, or of moments where the spec is of that kind.
+    """
     match spec.kind:
         case "number":
             return [key]
@@ -281,7 +334,7 @@ def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) 
 
 
 def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
-    """Return a parameter of an argument at zero, with its unit and plausible sizes in the session's length unit.
+    """Return a parameter of an argument, at value 0, with its unit and plausible sizes in the session's length unit.
 
     Args:
         key: the argument of the effect's function.
@@ -302,28 +355,30 @@ def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
 
 @dataclass(frozen=True)
 class _AtScanner:
-    """The function of an effect in the views of one scanner; elsewhere it does nothing."""
+    """The function of an effect of mount or sensor that acts in the views of one scanner alone."""
 
     of_all: Callable[..., Any]
     place: str
     scanner: str
 
     def __call__(self, known: Any, view: Any = None, **arguments: Any) -> Any:
-        """Return what the effect does in the views of its scanner, and nothing in others.
+        """Return what the effect's function returns, with no change in the views of other scanners.
+
+        An effect of the mount is called with all views and returns twists (V, 6). One of the sensor is called with the
+        points (N, 3) of a view and returns them moved.
 
         Args:
-            known: all views, of which an effect of the mount gives twists (V, 6); or points (N, 3) of one view, which
-                an effect of the sensor moves.
-            view: whose points they are.
+            known: all views, or the points (N, 3) of one view.
+            view: of these points; None: `known` are views.
         """
         views = known if self.place == "mount" else view.views
-        own = views.scanners.names.index(self.scanner)
-        has_it = views.scanners.of_view == own
+        index = views.scanners.names.index(self.scanner)
+        has_it = views.scanners.of_view == index
+        # Each scanner has a hand-eye, a standoff and a first view of its own.
+        of_scanner = views.by_scanner[index]
         if self.place == "mount":
-            return has_it[:, None] * self.of_all(views.by_scanner[own], **arguments)
-        return (
-            self.of_all(known, replace(view, views=views.by_scanner[own]), **arguments) if has_it[view.index] else known
-        )
+            return has_it[:, None] * self.of_all(of_scanner, **arguments)
+        return self.of_all(known, replace(view, views=of_scanner), **arguments) if has_it[view.index] else known
 
 
 EFFECTS: dict[str, Effect] = {}
@@ -338,7 +393,17 @@ def effect(
     prior: float = 1.0,
     **specs: Spec,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register the decorated function under its own name: of the library, or a user's where another module defines it.
+    """Return a decorator that registers a function in EFFECTS as an effect, under the function's name.
+
+    A user's effect replaces one of the same name that a user defined before.
+
+    Args:
+        place: where in the chain of frames it acts, a key of PLACES: it says what the function receives and returns.
+        needs: inputs without which it is left out: keys of `_WHERE_FROM`, as "joints", or names of covariates.
+        prefers: covariates that the function uses where the views have them; where they have none, time stands in.
+        tier: physical | user | geometry; empty: physical for functions of this package, user for others.
+        prior: prior odds relative to an effect that every arm, mount or part may have.
+        specs: one per argument of the function, by its name: `number`, `vector`, `per_joint` and so on.
 
     Raises:
         InputError: unknown place, a name that is taken, no docstring, or no parameter that can be fitted.
@@ -359,9 +424,8 @@ def effect(
             )
         of_library = (function.__module__ or "").startswith("stitch.effects.")
         known_tier = tier or ("physical" if of_library else "user")
-        needed, used = tuple(needs), tuple(prefers)
         EFFECTS[name] = Effect(
-            name, place, specs, function=function, needs=needed, prefers=used, tier=known_tier, prior=prior
+            name, place, specs, function, needs=tuple(needs), prefers=tuple(prefers), tier=known_tier, prior=prior
         )
         return function
 
@@ -369,7 +433,7 @@ def effect(
 
 
 def find_effect(name: str) -> Effect:
-    """Return an effect of the library or of a user's file.
+    """Return a registered effect by its name, or by EFFECT@SCANNER the same of one scanner.
 
     Raises:
         InputError: no such effect.
@@ -388,7 +452,10 @@ def find_effect(name: str) -> Effect:
 
 
 def of_each_scanner(views: Views, effects: Iterable[Effect]) -> list[Effect]:
-    """Return effects, where there are several scanners those of sensor and mount once for each, as effect@scanner."""
+    """Return the effects; with several scanners, those of sensor and mount once per scanner, as EFFECT@SCANNER.
+
+    The scanners' places, of tier geometry, stay one effect.
+    """
     names = views.scanners.names
     return [
         each
@@ -402,8 +469,10 @@ def of_each_scanner(views: Views, effects: Iterable[Effect]) -> list[Effect]:
 
 
 def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, ...]:
-    """Return the parameters of an effect in a session, at zero; where time stands in for a temperature, rates are per
-    hour."""
+    """Return the parameters of an effect in a session, at value 0, with the grids that depend on its views.
+
+    Where the effect prefers a temperature that was not measured, time stands in: units per °C become units per hour.
+    """
     views = measurement.views
     # An event can come before any view but the first two and the last: one view alone shows no event. Among hundreds of
     # views its place matters less than the time to try them all.
@@ -433,7 +502,10 @@ def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, 
 
 
 def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
-    """Return what an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
+    """Return the needs of an effect that a session lacks; () if it can have the effect.
+
+    An effect that prefers covariates needs one of them or time.
+    """
     views = measurement.views
     known_here = {
         "intensity": measurement.has_intensity,
@@ -449,12 +521,18 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
 
 
 def stands_still(measurement: Measurement, effect: Effect) -> bool:
-    """Return whether an effect is one of what hangs at the flange where that does not: the part, or the scanner."""
+    """Return True if an effect needs gravity to turn for scanner or part, whichever of the two stands still here.
+
+    What stands still in the cell does not turn against gravity.
+    """
     return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
 
 
 def is_asked(measurement: Measurement, effect: Effect) -> bool:
-    """Return whether an effect is a candidate here, or one that a user may like to know of."""
+    """Return True if an effect is a candidate here, or one that is listed with what it lacks.
+
+    Not those of tier geometry, of what stands still (`stands_still`), and of axes in a session without any.
+    """
     if effect.tier == "geometry" or stands_still(measurement, effect):
         return False
     return effect.place != "axis" or bool(measurement.views.axes)
@@ -476,12 +554,16 @@ def require_available(measurement: Measurement, effect: Effect) -> None:
 
 
 def describe_need(need: str) -> str:
-    """Return what an effect needs, as somebody who writes a session knows it."""
+    """Return a need, a key of `_WHERE_FROM` or the name of a covariate, in words: where a session states it."""
     return need if need.startswith("scanner ") else _WHERE_FROM.get(need, f"a column {need} in views.csv")
 
 
 def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return indices of the parameters of each joint or external axis; empty for an effect without them."""
+    """Return groups of indices of parameters, one for each joint or external axis; [] for an effect without them.
+
+    Parameters that are tried value by value (`grid`) belong to no joint's group. Of an effect of joints, an argument
+    that is no array over joints makes a group by itself.
+    """
     if effect.place == "axis":
         of_axes: dict[str, list[int]] = {}
         for i, parameter in enumerate(parameters):
@@ -499,18 +581,25 @@ def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]
 
 
 def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return indices of all parameters but an offset; empty for an effect without one, or of nothing else."""
+    """Return one group, the indices of all parameters that are not of kind `offset`, as a list of groups.
+
+    [] where the effect has no offset, or would have nothing to fit without it.
+    """
     others = [i for i, p in enumerate(parameters) if effect.specs[p.argument].kind != "offset"]
     fitted = any(not parameters[i].grid for i in others)
     return [others] if fitted and len(others) < len(parameters) else []
 
 
-def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return the smallest groups of parameters, by their indices, of which one can be true without the others.
+def separable_groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Return groups of indices of parameters, each of which may be in a model while the other groups are zero.
 
-    A row of a table by itself, the parameters of one joint, or else all.
+    - Effects of links, and empirical ones: each fitted parameter is a group.
+    - Effects of joints or axes: one group for each joint or axis.
+    - All others: the parameters without offsets, if there are any, and all parameters.
+
+    Parameters that are tried value by value (`grid`) are not fitted: alone they are no hypothesis.
     """
     if effect.place == "links" or effect.tier == "empirical":
-        # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
+        # A wrong length or angle in a DH row leaves the others right, as does one term of a polynomial.
         return [[i] for i, p in enumerate(parameters) if not p.grid]
     return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]

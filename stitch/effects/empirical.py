@@ -23,7 +23,10 @@ _MONOMIALS = [factors for degree in (1, 2) for factors in combinations_with_repl
 
 
 def empirical_effects(views: Views) -> list[Effect]:
-    """Return every empirical effect that these views can carry."""
+    """Return every empirical effect for these views: biases that follow a covariate or time, and the scanner's field.
+
+    Of each covariate with more than two values the Legendre polynomials of order 1 and 2, over its range.
+    """
     effects = []
     covariates = ({"time_s": views.time} if views.has("time") else {}) | views.covariates
     for name, values in covariates.items():
@@ -38,13 +41,21 @@ def empirical_effects(views: Views) -> list[Effect]:
 def _effect(
     group: str, name: str, place: str, function: Callable[..., Array], needs: tuple[str, ...] = (), **specs: Spec
 ) -> Effect:
+    """Return an effect of the empirical tier; `group` is what it follows, for people."""
     return Effect(name, place, specs, function=function, needs=needs, prefers=(), tier="empirical", group=group)
 
 
 def _bias(name: str, order: int, shape: Array) -> Effect:
-    """Return the effect of a bias along the ray that follows `shape` (N,): a Legendre polynomial of this order."""
+    """Return the effect that moves all points of view v along their rays by k·shape[v], k in length_unit.
+
+    Args:
+        name: of the covariate.
+        order: of the Legendre polynomial P.
+        shape: (V,) P of the covariate scaled to ±1, at each view.
+    """
 
     def bias(points: Array, view: ScanView, k: float) -> Array:
+        """Return points (N, 3) of a view, scanner frame, with its bias along the rays."""
         return points + view.along(points) * (k * shape[view.index])
 
     bias.__doc__ = f"along the ray by k·P{order}({name})"
@@ -52,8 +63,11 @@ def _bias(name: str, order: int, shape: Array) -> Effect:
 
 
 def _field() -> Effect:
-    """Return points that move in all three directions by a function of where they are seen; 0.1 mm at the edge is
-    usual."""
+    """Return the effect that moves points by polynomials of where they are in the scanner's field, in x, y and z.
+
+    Each of three coordinates has a coefficient, in length_unit, for each monomial of degree 1 and 2 in a = x/z, b = y/z
+    and d = r/r₀ − 1. Typical sizes of the coefficients move a point at the edge of the field by 0.1 mm.
+    """
     terms = {f"c{axis}_{''.join(factors)}": (axis, factors) for axis in range(3) for factors in _MONOMIALS}
 
     def distort(points: Array, view: ScanView, **c: float) -> Array:

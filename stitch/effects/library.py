@@ -127,7 +127,7 @@ def robot_thermal_growth(links: Links, views: Views, g: float) -> Links:
 
 
 def warmer(views: Views, covariate: str) -> Array:
-    """Return (V,) ΔT since the first view, or hours where nobody measured."""
+    """Return a temperature (V,) less that of the first view, °C; hours since then where it was not measured."""
     return views.since_first(covariate) if covariate in views.covariates else views.hours
 
 
@@ -278,12 +278,17 @@ def _droop(gravity: Array, s: float, w: Array, a: Array) -> Array:
 
 
 def _bend(gravity: Array, S: Array, w: Array, a: Array) -> Array:
-    """Return (V, 6) twists about the flange's origin by gravity (V, 3), both in its frame.
+    """Return twists (V, 6) of a fixture under its load, about the flange's origin and in the flange frame.
 
-    What an elastic fixture does under a weight is linear in the direction of gravity. Its rotation is K·(d×g), K
-    symmetric and d the lever of the weight, which has no trace. Of its shift only what differs between directions is
-    seen: down by the same in all views moves all they see. Where the flange looks down there is none: so the hand-eye
-    is that of a pose that cells measure in.
+    Elastic deflections are linear in the direction of gravity g: rotation w×δ + A·δ, translation S·δ, with δ = g − z.
+    A, symmetric, has no trace, since a rotation K·(d×g) by a weight at lever d, K symmetric, has none. Counted from
+    g = z, the flange looking down, the deflection is zero there: so the hand-eye is that of a usual pose.
+
+    Args:
+        gravity: (V, 3) unit vectors g, flange frame.
+        S: (6,) length_unit: xx, yy, zz, xy, xz, yz.
+        w: (3,) rad.
+        a: (5,) rad, of A: xx, yy, xy, xz, yz.
     """
     turned = gravity - [0.0, 0.0, 1.0]
     tilt = _symmetric(a[0], a[1], -a[0] - a[1], *a[2:])

@@ -31,12 +31,10 @@ _LIMIT = "STITCH_EFFECT_SECONDS"
 
 
 def load(path: Path) -> list[str]:
-    """Run the file; its effects join the registry, in place of those of the file before.
+    """Execute a Python file, register its effects in EFFECTS, and return their names.
 
-    The file is Python and is executed: load only files that you would run.
-
-    Returns:
-        Their names.
+    They replace those of the file that was loaded before. The file can do all that Python can: load only files that you
+    would run.
 
     Raises:
         InputError: no such file, no Python file, an error in it (with its line), or no effect in it. The registry is
@@ -52,7 +50,7 @@ def load(path: Path) -> list[str]:
         del EFFECTS[name]
     try:
         with _name_errors(path, ""):
-            # As it stands: Python's own import would leave a cache beside the file, and may take one that is old.
+            # Not imported: that would leave a cache beside the file, or use one that is out of date.
             exec(compile(path.read_bytes(), path, "exec"), vars(importlib.util.module_from_spec(spec)))
         names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
         if not names:
@@ -64,15 +62,17 @@ def load(path: Path) -> list[str]:
         EFFECTS.update(before)
         raise
     for name in names:
-        own = EFFECTS[name]
-        EFFECTS[name] = replace(own, tier="user", function=_guard_function(own, path), origin=str(path.resolve()))
+        defined = EFFECTS[name]
+        guarded = _guard_function(defined, path)
+        EFFECTS[name] = replace(defined, tier="user", function=guarded, origin=str(path.resolve()))
     return names
 
 
 def load_packages() -> None:
-    """Let the effects join the registry that installed packages offer by the entry-point group `stitch.effects`.
+    """Register the effects of installed packages in EFFECTS: those of the entry-point group `stitch.effects`.
 
-    An entry names a module, or a function without arguments, that uses @effect. What fails is one warning.
+    An entry names a module, or a function without arguments, that uses @effect. An entry that fails leaves the registry
+    as it was, with one warning.
     """
     for entry in entry_points(group="stitch.effects"):
         before = dict(EFFECTS)
@@ -93,10 +93,13 @@ def load_packages() -> None:
 
 
 def _require_effect(effect: Effect, where: str) -> None:
-    """Refuse parameters without a plausible size, and a function that does not take them.
+    """Refuse a user's effect with wrong specs, or whose function lacks an argument for one of them.
+
+    Args:
+        where: names file and effect at the beginning of the message.
 
     Raises:
-        InputError: with `where` in front.
+        InputError: names the argument, and how to fix it.
     """
     for key, spec in effect.specs.items():
         if not isinstance(spec, Spec) or spec.kind not in _KINDS:
@@ -124,13 +127,12 @@ def _require_effect(effect: Effect, where: str) -> None:
 
 
 def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
-    """Return the effect's function; what goes wrong in it names the file and the line, and so does a result that cannot
-    be."""
+    """Return the effect's function wrapped: its errors become one line that names the file, and results are checked."""
 
     @wraps(effect.function)
     def function(*arguments: Any, **parameters: Any) -> Any:
-        """Call the effect on arrays that it may not write into, and return its result once that is checked."""
-        # An effect returns what changes and leaves what it is given.
+        """Call the effect with its arrays read-only, and return its result, checked."""
+        # An effect must return a changed array and leave the one that it is given: writing raises an error.
         views = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
         for value in views:
             if isinstance(value, np.ndarray):
@@ -143,7 +145,11 @@ def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
 
 
 def _require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, where: str) -> Any:
-    """Return what an effect's function returned, as float arrays.
+    """Return the result of an effect's function, checked, as float arrays.
+
+    Args:
+        arguments: with which it was called: their shape is that of the result, or (V, 6) of twists.
+        where: names file and effect at the beginning of the message.
 
     Raises:
         InputError: another shape than the place asks for, or values that are no real numbers.
@@ -162,7 +168,11 @@ def _require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, whe
 
 
 def _require_numbers(result: Any, like: Array, where: str) -> Array:
-    """Return `result` as numbers of the shape of `like`; where `like` is not finite, it need not be."""
+    """Return a result as floats, if its shape is that of `like`, and it is finite wherever `like` is.
+
+    Raises:
+        InputError: it is not; the message begins with `where`.
+    """
     try:
         values = np.asarray(result)
     except ValueError:
@@ -176,6 +186,7 @@ def _require_numbers(result: Any, like: Array, where: str) -> Array:
 
 
 def _describe_result(result: Any) -> str:
+    """Return a wrong result in words: its kind of numbers and shape, or its type."""
     if isinstance(result, np.ndarray):
         kind = {"c": "complex numbers", "O": "objects", "b": "truth values"}.get(result.dtype.kind, "an array")
         return f"{kind} of shape {result.shape}"
@@ -188,7 +199,14 @@ def _is_number(value: Any) -> bool:
 
 @contextmanager
 def _name_errors(path: Path, what: str) -> Iterator[None]:
-    """Raise errors, ends of the program and endless loops in a user's file as one line."""
+    """Turn what goes wrong in a user's code, in the block, into an InputError of one line.
+
+    Errors of any kind, SystemExit, and code that runs longer than the limit of time.
+
+    Args:
+        path: of the user's file.
+        what: names the effect in the message; empty: the file itself.
+    """
     seconds = _seconds()
     late = (
         f"{path}:{what} does not end within {seconds:g} s; to fix: look for a loop in it, or allow more seconds in the "
@@ -208,7 +226,11 @@ def _name_errors(path: Path, what: str) -> Iterator[None]:
 
 
 def _seconds() -> float:
-    """Return after how many seconds a call of a user's effect is ended, as the environment or else the default says."""
+    """Return the limit of time of a call of a user's effect, s: of the environment variable `_LIMIT`, else `_SECONDS`.
+
+    Raises:
+        InputError: the variable holds no positive number.
+    """
     try:
         seconds = float(os.environ.get(_LIMIT, _SECONDS))
     except ValueError:
@@ -219,7 +241,7 @@ def _seconds() -> float:
 
 
 def _error_line(error: BaseException, path: Path) -> str:
-    """Return the last line of the file that an error passed through."""
+    """Return " line N" for the innermost line of the file that an error passed through; empty if there is none."""
     if isinstance(error, SyntaxError):
         return "" if error.lineno is None else f" line {error.lineno}"
     trace, line = error.__traceback__, ""

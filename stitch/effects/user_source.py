@@ -44,14 +44,27 @@ def source_of(effects: Sequence[Effect]) -> str:
 
 
 def _collect(name: str, value: Any, where: str, imports: dict[str, None], pieces: dict[str, str]) -> None:
-    """Add what a name stands for, after all that it needs itself."""
+    """Add the source that defines a name to `pieces` or `imports`, and before it that of all names which it uses.
+
+    Modules and installed objects become imports; functions and classes of the program their source; arrays and literals
+    an assignment.
+
+    Args:
+        name, value: what the name stands for in the program.
+        where: names the effect in a message.
+        imports: import statements so far, as keys; added to.
+        pieces: name -> its source so far, in the order of the file; added to.
+
+    Raises:
+        InputError: a value that no file can hold.
+    """
     if name in pieces:
         return
     if isinstance(value, ModuleType):
         _require_installed(value, name, where)
         imports[f"import {value.__name__} as {name}"] = None
     elif isinstance(value, (FunctionType, type)) and not _is_installed(sys.modules.get(value.__module__)):
-        pieces[name] = ""  # its place, so that two that name each other end
+        pieces[name] = ""  # marked as begun: two functions that call each other would not end
         source = _source(name, value, where)
         known = _globals(value)
         for needed in _names(source):
@@ -73,7 +86,11 @@ def _collect(name: str, value: Any, where: str, imports: dict[str, None], pieces
 
 
 def _source(name: str, value: Any, where: str) -> str:
-    """Return the statement that gives a function or a class its name."""
+    """Return the source of a function or class: the one statement, a def, class or assignment, that gives it its name.
+
+    Raises:
+        InputError: there is no source, or no such statement; `where` names the effect.
+    """
     try:
         source = textwrap.dedent(inspect.getsource(value)).rstrip()
         statement = ast.parse(source).body[0]
@@ -88,7 +105,7 @@ def _source(name: str, value: Any, where: str) -> str:
 
 
 def _globals(value: Any) -> dict[str, Any]:
-    """Return what the names in a function, or in a class, stand for."""
+    """Return name -> value for the names that a function or class can use: its module's, and those it encloses."""
     if isinstance(value, type):
         return vars(sys.modules[value.__module__])
     return {**value.__globals__, **inspect.getclosurevars(value).nonlocals}
@@ -101,7 +118,7 @@ def _names(source: str) -> list[str]:
 
 
 def _is_installed(module: ModuleType | None) -> bool:
-    """Return whether every program finds a module: Python's own, and installed ones."""
+    """Return True if every program can import a module: Python's own and installed ones; not the program itself."""
     file = getattr(module, "__file__", None)
     if module is None or module.__name__ == "__main__":
         return False
@@ -117,7 +134,12 @@ def _require_installed(module: ModuleType, name: str, where: str) -> None:
 
 
 def _require_literal(name: str, value: Any, where: str) -> None:
-    """Refuse a value, used by a user's effect under a name, that Python source cannot spell."""
+    """Refuse a value that does not equal what its `repr` evaluates to, so that no source can state it.
+
+    Args:
+        name: under which a user's effect uses it.
+        where: names the effect in the message.
+    """
     try:
         same = bool(ast.literal_eval(repr(value)) == value)
     except (ValueError, SyntaxError, TypeError):
@@ -127,7 +149,13 @@ def _require_literal(name: str, value: Any, where: str) -> None:
 
 
 def _require_same(text: str, effects: Sequence[Effect]) -> None:
-    """Refuse a file that, executed by itself, does not define the effects again."""
+    """Refuse the text of a file that, executed alone, does not define all of the effects with the same specs.
+
+    The registry is restored afterwards.
+
+    Raises:
+        InputError: names the effect, or the error of the file.
+    """
     before = dict(EFFECTS)
     try:
         exec(compile(text, FILE, "exec"), {"__name__": "stitch_user_effects"})

@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from stitch.effects.contract import one_by_one
+from stitch.effects.contract import separable_groups
 from stitch.errors import NoResultError
 from stitch.fit.coarse import CoarseHandEye
 from stitch.fit.correct import Correction
@@ -168,7 +168,7 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
     groups, effects, first = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
         if not any(p.kept for p in term.parameters):
-            of_term = one_by_one(term.effect, term.parameters)
+            of_term = separable_groups(term.effect, term.parameters)
             groups += [[first + i for i in group] for group in of_term]
             effects += [number] * len(of_term)
         first += len(term.parameters)

@@ -40,7 +40,7 @@ class AxisPlace(Value):
     unobservable: tuple[str, ...] = ()
 
     def line(self, length_unit: str) -> str:
-        """Return it as people read it: direction in mrad across, point in mm, ± U (k = 2).
+        """Return the axis as a line for people: direction as a unit vector, point in mm, each with ± U (k = 2).
 
         Example:
             >>> [axis.line("mm") for axis in run.axes]
@@ -60,7 +60,10 @@ class AxisPlace(Value):
 
 
 def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]:
-    """Return where the axes of a session stand, in their order; none without axes."""
+    """Return where a model puts the axes of a session, with sigmas, in their order; () without axes.
+
+    Sigmas to first order, by differences of direction and point in hand-eye and placement.
+    """
     axes = measurement.views.axes
     if not axes:
         return ()
@@ -75,9 +78,11 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
             [(_as_stated(measurement, *_moved(model, term, step), k, near) - here) / _STEP for step in steps]
         ).reshape(len(steps), 6)
         sigma = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", J, covariance, J), 0.0))
-        hidden, unknown = _unseen(axis, term, alone=not axes.has_robot, is_own=k == axes.frame_axis)
-        sigma[:3][hidden[0]] = np.nan
-        sigma[3:][hidden[1]] = np.nan
+        no_sigma, unobservable = _unseen(
+            axis, term, without_robot=not axes.has_robot, is_frame_axis=k == axes.frame_axis
+        )
+        sigma[:3][no_sigma[0]] = np.nan
+        sigma[3:][no_sigma[1]] = np.nan
         places.append(
             AxisPlace(
                 axis.name,
@@ -86,14 +91,21 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
                 sigma[:3],
                 here[3:] if axis.is_rotary else None,
                 sigma[3:] if axis.is_rotary else None,
-                unknown,
+                unobservable,
             )
         )
     return tuple(places)
 
 
 def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
-    """Return steps (6 + P, 6 + P) of hand-eye and placement, and their covariance."""
+    """Return steps for differences, one a row (6 + P, 6 + P), and the covariance (6 + P, 6 + P) of what is stepped.
+
+    The first six are the hand-eye's twist T·exp(ξ), the others the parameters of axis_placement; zero covariance for
+    those that were not fitted.
+
+    Args:
+        names: effect.parameter of the P parameters.
+    """
     known = model.effects_covariance
     size = 6 + len(names)
     covariance = np.zeros((size, size))
@@ -112,13 +124,19 @@ def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
 
 
 def _moved(model: Model, term: Term | None, step: Array) -> tuple[Model, Term | None]:
+    """Return the hand-eye and the placement moved by a step (6 + P,): a twist, then changes of the parameters."""
     T_mount = model.T_mount @ frames.exp(step[:6])
     moved = None if term is None else term.at(values_of([term]) + step[6:])
     return Model(T_mount), moved
 
 
 def _as_stated(measurement: Measurement, model: Model, term: Term | None, k: int, near: Array) -> Array:
-    """Return direction and point (6,) of axis k, in the frame in which session.toml states it."""
+    """Return direction and point (6,) of axis k: in the robot's base frame, without a robot in the scanner's.
+
+    Args:
+        term: axis_placement with its values; None: the axes as stated.
+        near: (3,) same frame; the point returned is the one on the axis that is nearest to it.
+    """
     axes = measurement.views.axes
     motion = axes.as_read() if term is None else chain_errors(measurement, [term]).axes
     assert motion is not None
@@ -134,7 +152,7 @@ def _as_stated(measurement: Measurement, model: Model, term: Term | None, k: int
 
 
 def _middle(measurement: Measurement, model: Model) -> Array:
-    """Return the middle (3,) of what the views show, with all axes at zero, base frame or that of a still scanner."""
+    """Return the mean (3,) over the views of their points: reference frame, without a robot the scanner's."""
     shown = [points.mean(axis=0) for points in measurement.capture.visible_points if len(points)]
     if not measurement.views.axes.has_robot:
         return np.asarray(np.mean(shown, axis=0))
@@ -143,17 +161,25 @@ def _middle(measurement: Measurement, model: Model) -> Array:
     return np.asarray(np.mean(placed, axis=0))
 
 
-def _unseen(axis: Axis, term: Term | None, *, alone: bool, is_own: bool) -> tuple[tuple[bool, bool], tuple[str, ...]]:
-    """Return whether direction and point have no sigma, and what the views do not show."""
-    if is_own:
+def _unseen(
+    axis: Axis, term: Term | None, *, without_robot: bool, is_frame_axis: bool
+) -> tuple[tuple[bool, bool], tuple[str, ...]]:
+    """Return (direction, point): True where it has no sigma; and words for what the views do not show.
+
+    Args:
+        term: axis_placement; None: it was not fitted.
+        without_robot: axes alone move what is scanned.
+        is_frame_axis: without a robot, the axis in whose frame the others are given: the hand-eye places it.
+    """
+    if is_frame_axis:
         return (False, False), ()
     if axis.is_fixed or term is None:
         return (True, True), ()
     mine = [p for p in term.parameters if p.name.partition("_")[2] == axis.name]
     turned = [p.fitted for p in mine if p.unit == "rad"]
     moved = [p.fitted for p in mine if p.unit != "rad"]
-    if alone and any(turned) and (any(moved) or not moved):
-        # Their common frame is free to turn about its own axis and to move along it.
+    if without_robot and any(turned) and (any(moved) or not moved):
+        # The common frame may turn about its own axis and move along it: one of two parameters is always held.
         return (False, False), ()
     unknown = [f"{what} not known" for what, seen in (("direction", turned), ("place", moved)) if not all(seen)]
     return (not all(turned), not all(moved)), tuple(unknown)

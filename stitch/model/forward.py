@@ -27,29 +27,29 @@ STEP, _STEP_GRIDDED = 0.1, 0.005
 
 @dataclass(frozen=True)
 class ChainErrors:
-    """What effects of base, robot, mount and part do to the chain of frames of V views."""
+    """The true chain of frames of V views, with all that effects of base, robot, links, mount, part and axes change."""
 
-    joints: Array  # (V, n) rad, as they truly were
-    links: Links  # as they truly are
-    mount: Array  # (V, 6) twist right of the hand-eye
+    joints: Array  # (V, n) rad, the true angles
+    links: Links  # the true ones
+    mount: Array  # (V, 6) twist to the right of the hand-eye: T_mount · exp(mount)
     part: Array  # (V, 6) twist of the part in the reference frame
     base: Array  # (V, 6) twist of the robot's base in the base frame
     axes: AxisMotion | None = None  # of the external axes, as they truly move
 
 
 def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
-    """Return how effects change joint angles, links, mount, part, base and axes of the chain of frames, in all views.
+    """Return the true chain of frames of all views under effects: joints, links, and twists of mount, part and base.
 
     Args:
-        terms: effects with their values.
-        base: what others have done already; None: nothing.
+        terms: effects with their values, applied in this order.
+        base: the chain under other effects, to which these are added; None: the reported chain.
     """
     views = measurement.views
     if base is None:
-        right = exact_links(*views.joints.shape)
+        exact = exact_links(*views.joints.shape)
         axes = views.axes.as_read() if views.axes else None
-        still = np.zeros((views.count, 6))
-        base = ChainErrors(views.joints, right, still, still, still, axes)
+        none = np.zeros((views.count, 6))
+        base = ChainErrors(views.joints, exact, none, none, none, axes)
     joints, mount, part, axes = base.joints, base.mount, base.part, base.axes
     tilt = base.base
     # A user's own effect may change the links that it is given in place.
@@ -73,7 +73,11 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
 
 
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
-    """Return (V, 4, 4) what stands left and right of the hand-eye under effects of base, robot, mount and part."""
+    """Return L and R (V, 4, 4) of T_reference_scanner = L · T_mount · R under effects of base, robot, mount and part.
+
+    L is exp(−part) · T_reference_mount with the true arm and axes; R is exp(mount), behind the place of the view's
+    scanner if there are several.
+    """
     errors = chain_errors(measurement, terms)
     T_base_flange = measurement.T_base_flange
     if any(term.effect.place in ARM_PLACES for term in terms):
@@ -90,7 +94,10 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
 
 
 def _under_base(measurement: Measurement) -> Array:
-    """Return (V, 4, 4) what stands between the frame of the reported poses and the base that carries the arm."""
+    """Return U (V, 4, 4) with T_base_flange = U · forward(reported joints): reported poses against nominal ones.
+
+    It holds external axes that carry the robot, and what a calibrated controller knows of its arm. 1 without joints.
+    """
     if measurement.robot is None or not measurement.views.has("joints"):
         return np.broadcast_to(np.eye(4), measurement.T_base_flange.shape)
     return measurement.T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints))
@@ -99,28 +106,34 @@ def _under_base(measurement: Measurement) -> Array:
 def scan_correction(
     measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice
 ) -> Array:
-    """Return (N, 3) what must be added to the scanned points of view v, scanner frame, to undo sensor and part effects.
+    """Return vectors (N, 3), scanner frame, that added to scanned points of view v undo effects of sensor and shape.
 
     Args:
         pose: (4, 4) T_reference_scanner of the view.
+        index: which points.
     """
     points, view = scan_points(measurement, v, index)
     return point_correction(terms, points, view, pose)
 
 
 def scan_points(measurement: Measurement, v: int, index: Indices | slice) -> tuple[Array, ScanView]:
-    """Return some points (N, 3) of view v, scanner frame, and what effects may know of them."""
+    """Return the points (N, 3) of view v at `index`, scanner frame, and the view with slant and intensity of these."""
     view = measurement.scan_views[v]
     intensity = None if view.intensity is None else view.intensity[index]
     return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
 def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:
-    """Return (N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects.
+    """Return the vectors (N, 3), scanner frame, that added to measured points undo effects of sensor and shape.
+
+    An effect of the sensor maps true points to reported ones: its inverse is found by fixed-point steps.
 
     Args:
-        steps: of fixed point. Corrections are thousandths of the range: the first leaves thousandths of them, which is
-            enough for a slope, the second millionths.
+        points: (N, 3) measured, scanner frame.
+        view: what effects may know of them.
+        pose: (4, 4) T_reference_scanner of the view: effects of shape act in the reference frame.
+        steps: of the fixed point. Corrections are thousandths of the range: the first leaves thousandths of them, which
+            is enough for a slope, the second millionths.
     """
     true = points
     for term in (t for t in terms if t.effect.place == "sensor"):
@@ -137,11 +150,13 @@ def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose:
 def target_correction(
     measurement: Measurement, terms: Sequence[Term], poses: Array, places: Array | None = None
 ) -> Array:
-    """Return (V, S, 3) what must be added to the labelled points of all views to undo sensor and part effects; zero in
-    empty slots.
+    """Return the vectors (V, S, 3), sensor frame, that added to labelled points undo effects of sensor and shape.
+
+    Zero in empty slots. Effects are evaluated at the targets' mean positions, not at the points as measured.
 
     Args:
-        places: (V, S, 3) of the points, as `target_places` finds them under the same effects.
+        poses: (V, 4, 4) T_reference_scanner.
+        places: (V, S, 3) those positions, from `target_places` with the same effects; None: they are computed.
     """
     sightings = measurement.capture.sightings
     assert sightings is not None
@@ -152,16 +167,19 @@ def target_correction(
     shown = frames.transform(to_sensor, places)
     grown = _displaced("shape", terms, measurement.target_views, places)
     points = shown.copy() if grown is places else frames.transform(to_sensor, grown)
-    apart = shown - _displaced("sensor", terms, measurement.target_views, points)
-    return np.where((sightings.target >= 0)[..., None], apart, 0.0)
+    correction = shown - _displaced("sensor", terms, measurement.target_views, points)
+    return np.where((sightings.target >= 0)[..., None], correction, 0.0)
 
 
 def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array, steps: int = 2) -> Array:
-    """Return (V, S, 3) where the targets in the slots of all views lie, reference frame: the mean of the views that use
-    each.
+    """Return the position (V, S, 3), reference frame, of the target in each slot: the mean of all views that use it.
 
-    An effect is evaluated there. At a point as it was measured it would hold the error of that point, times the effect,
-    and explain the error by itself (errors in variables; Fuller 1987, Measurement Error Models).
+    Effects are evaluated there. At the measured point an effect's column would contain that point's own error, and the
+    fit would explain the error by it (errors in variables; Fuller 1987, Measurement Error Models).
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        steps: of the fixed point between positions and corrections, where effects move points.
     """
     s = measurement.capture.sightings
     assert s is not None
@@ -174,6 +192,7 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
     slots = np.where(s.target >= 0, s.target, first[:, None])
 
     def mean(points: Array) -> Array:
+        """Return per slot (V, S, 3) the mean over views of its target's points; an unused target stays where it is."""
         sums = np.zeros((len(s.targets), 3))
         np.add.at(sums, s.target[used], points[used])
         out = np.where((s.view_counts[slots] > 0)[..., None], (sums / count)[slots], points)
@@ -187,7 +206,10 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
 
 
 def _displaced(place: str, terms: Sequence[Term], views: Sequence[ScanView], points: Array) -> Array:
-    """Return points (V, N, 3) of all views where the effects of one place put them, the last effect first."""
+    """Return true points (V, N, 3) of all views as displaced by the effects of one place, the last effect first.
+
+    The reverse of the order in which `point_correction` undoes them.
+    """
     for term in (t for t in reversed(terms) if t.effect.place == place):
         displace = partial(term.effect.function, **term.arguments)
         points = np.array([displace(of_view, view) for of_view, view in zip(points, views, strict=True)])
@@ -195,12 +217,12 @@ def _displaced(place: str, terms: Sequence[Term], views: Sequence[ScanView], poi
 
 
 def moves_points(terms: Sequence[Term]) -> bool:
-    """Return whether an effect changes the points within a view, and not only where the view sits."""
+    """Return True if an effect moves the points of a view against each other, not only the view as a whole."""
     return any(term.effect.place in ("sensor", "shape") for term in terms)
 
 
 def true_geometry(measurement: Measurement, model: Model) -> tuple[Array, list[Array]]:
-    """Return poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
+    """Return true poses T_reference_scanner (V, 4, 4) and true points (N, 3) of each scan: the effects undone."""
     poses = _without_motion(measurement, model.terms).poses(model.T_mount)
     points = [scan.points for scan in measurement.capture.scans]
     if moves_points(model.terms):
@@ -210,7 +232,7 @@ def true_geometry(measurement: Measurement, model: Model) -> tuple[Array, list[A
 
 
 def corrected_capture(measurement: Measurement, model: Model) -> Capture:
-    """Return the capture as it would be without the effects of the model."""
+    """Return the capture with the effects of the model undone: true chain of frames, scans and labelled points."""
     terms = model.terms
     capture = _without_motion(measurement, terms)
     if moves_points(terms):
@@ -226,16 +248,21 @@ def corrected_capture(measurement: Measurement, model: Model) -> Capture:
 
 
 def _without_motion(measurement: Measurement, terms: Sequence[Term]) -> Capture:
-    """Return the capture without effects of robot, mount and part; the points as they were scanned."""
+    """Return the capture with the true T_reference_mount and T_behind_mount; points stay as they were scanned."""
     left, right = perturbed_frames(measurement, terms)
     return replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
 
 
 def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
-    """Yield per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
+    """Yield per term the derivatives (P, V, 6) of the views' poses by its P parameters: ξ of exp(ξ)·T, about `centre`.
 
-    About the model with the term in place of its own, or added at its values; the view of an event moves nothing.
+    By central differences, at the model with the term added, or in place of its term of the same effect. Zero for the
+    view of an event, which is tried and not fitted.
+
+    Args:
+        centre: (3,) reference frame.
     """
+    # One Jacobian of the chain serves all terms that leave the chain at the same errors.
     chain = None
     in_use = chain_errors(measurement, model.terms)
     for term in terms:
@@ -257,15 +284,18 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
 
 @dataclass(frozen=True)
 class _ChainJacobian:
-    """How the views answer to small errors of the chain of frames, about those of a model."""
+    """Derivatives of the views' poses by small changes of the chain of frames, at the chain under a model's effects.
+
+    All results are twists ξ of exp(ξ)·T_reference_scanner about a centre, reference frame, rotation first.
+    """
 
     measurement: Measurement
     about: Model
-    errors: ChainErrors
-    to_centre: Array  # (4, 4)
+    errors: ChainErrors  # the chain under that model
+    to_centre: Array  # (4, 4) translation of the reference frame's origin to the centre
 
     def is_about(self, errors: ChainErrors) -> bool:
-        """Return whether errors are those of this model: of the same effects, summed in another order, they are."""
+        """Return True if a chain equals this one up to rounding, as of the same effects summed in another order."""
         arrays, others = (
             (e.joints, *vars(e.links).values(), e.mount, e.part, e.base, *(vars(e.axes).values() if e.axes else ()))
             for e in (self.errors, errors)
@@ -274,10 +304,11 @@ class _ChainJacobian:
         return all(np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in pairs)
 
     def twists(self, steps: Sequence[Sequence[ChainErrors]], place: str) -> Array:
-        """Return (P, V, 6) left twists of the views between the two errors of each step, near these.
+        """Return twists (P, V, 6) of the views from the second chain of each pair to the first.
 
         Args:
-            place: in the chain, of what was stepped.
+            steps: P pairs of chains near this one, a parameter stepped up and down.
+            place: where in the chain the stepped effect acts: only that part of the chains is compared.
         """
         if place == "axis":
             carried = self.measurement.views.axes.carried
@@ -298,88 +329,97 @@ class _ChainJacobian:
 
     @cached_property
     def flange(self) -> FlangeSlopes:
-        """Body twists of the flange."""
+        """Derivatives of the flange's pose by joints and links, twists in the flange frame."""
         assert self.measurement.robot is not None
         return flange_slopes(self.measurement.robot, self.errors.joints, self.errors.links)
 
     @cached_property
     def of_flange(self) -> Array:
-        """(V, 6, 6) for body twists of the flange."""
+        """(V, 6, 6) maps twists in the flange frame, T_base_flange·exp(ξ), to twists of the views about the centre."""
         if self.measurement.eye_to_hand:
-            # (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹: the flange's own side stands left.
+            # The flange is the reference frame, and its pose is inverted: (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹.
             return -frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
         return frames.adjoint(self._left)
 
     @cached_property
     def of_base(self) -> Array:
-        """(V, 6, 6) for changes of the twist of the base, which external axes may carry."""
+        """(V, 6, 6) maps changes of the base's twist to twists of the views; axes may carry the base."""
         under = frames.adjoint(_under_base(self.measurement))
         return self.of_axes @ under @ frames.left_jacobian(self.errors.base)
 
     @cached_property
     def of_axes(self) -> Array:
-        """(V, 6, 6) for twists left of the flange's effective pose."""
+        """(V, 6, 6) maps twists ξ of the flange's effective pose, exp(ξ)·T_base_flange, to those of the views."""
         if self.measurement.eye_to_hand:
             return -frames.adjoint(self._left)
         return frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
 
     @cached_property
     def of_mount(self) -> Array:
-        """(V, 6, 6) for changes of the twist of the mount: exp(m + δ) = exp(J δ)·exp(m)."""
+        """(V, 6, 6) maps changes δ of the mount's twist m to twists of the views: exp(m + δ) ≈ exp(J δ)·exp(m)."""
         behind = self.measurement.views.scanners.behind
         T_mount = self.about.T_mount if behind is None else self.about.T_mount @ behind
         return frames.adjoint(self._left @ T_mount) @ frames.left_jacobian(self.errors.mount)
 
     @cached_property
     def of_part(self) -> Array:
-        """(V, 6, 6) for changes of the twist of the part."""
+        """(V, 6, 6) maps changes of the part's twist to twists of the views."""
         return -(frames.adjoint(self.to_centre) @ frames.left_jacobian(-self.errors.part))
 
     @cached_property
     def _left(self) -> Array:
-        """Return (V, 4, 4) what stands left of the hand-eye, about the centre."""
+        """T_centre_mount (V, 4, 4): all to the left of the hand-eye, the reference frame's origin at the centre."""
         return self.to_centre @ perturbed_frames(self.measurement, self.about.terms)[0]
 
 
 def _apply_matrices(matrix: Array, vectors: Array) -> Array:
-    """Return (P, V, 6) of (V, 6, 6) and (P, V, 6)."""
+    """Return matrix[v] @ vectors[p, v] (P, V, 6) for matrices (V, 6, 6) and vectors (P, V, 6)."""
     return (matrix @ vectors.transpose(1, 2, 0)).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True)
 class PointSlopes:
-    """What must be added to measured points, per unit of each of the terms' P parameters: scanner frame.
+    """Derivatives, by the P parameters of some terms, of the vectors that added to measured points undo all effects.
 
-    About the model with each term in place of its own, or added at its values.
+    By central differences, at the model with each term added, or in place of its term of the same effect.
     """
 
     measurement: Measurement
     terms: Sequence[Term] = ()
-    model: Model | None = None  # None: without terms
+    model: Model | None = None  # may be None where there are no terms
 
     def at(self, v: int, pose: Array, index: Indices | slice) -> Array:
-        """Return (P, N, 3) for some points of view v, which stands at `pose` (4, 4) T_reference_scanner."""
+        """Return the derivatives (P, N, 3), scanner frame, for the points of view v at `index`.
+
+        Args:
+            pose: (4, 4) T_reference_scanner of the view.
+        """
         points, view = scan_points(self.measurement, v, index)
         return self._differences(lambda terms: point_correction(terms, points, view, pose, steps=1))
 
     def at_targets(self, poses: Array) -> Array:
-        """Return (P, V, S, 3) for the labelled points of all views."""
+        """Return the derivatives (P, V, S, 3), sensor frame, for the labelled points of all views.
+
+        Args:
+            poses: (V, 4, 4) T_reference_scanner.
+        """
         places = target_places(self.measurement, () if self.model is None else self.model.terms, poses)
         return self._differences(lambda terms: target_correction(self.measurement, terms, poses, places))
 
     def _differences(self, moved: Callable[[Sequence[Term]], Array]) -> Array:
+        """Return the central differences (P, ...) of a function of the terms in use that returns an array (...)."""
         if not self._steps:
             return moved(())[None][:0]
         return np.array([(moved(up) - moved(down)) / width for up, down, width in self._steps])
 
     @cached_property
     def _steps(self) -> list[tuple[tuple[Term, ...], tuple[Term, ...], float]]:
-        """The effects of the model with one parameter larger and smaller, and how far these are apart."""
+        """Per parameter the terms of the model with it stepped up, with it stepped down, and the width between them."""
         steps = []
         for term in self.terms:
             assert self.model is not None
             for i, parameter in enumerate(term.parameters):
-                # The view of an event is tried, never fitted: nothing answers to it.
+                # The view of an event is tried, never fitted: its derivative is zero, over any width.
                 size = 0.0 if parameter.discrete else STEP * parameter.typical
                 up, down = (self.model.with_term(moved).terms for moved in _stepped(term, i, size))
                 steps.append((up, down, 2 * size or 1.0))
@@ -387,7 +427,7 @@ class PointSlopes:
 
 
 def _stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:
-    """Return the term with parameter i larger and smaller by a step."""
+    """Return the term with parameter i increased by `size`, and with it decreased by as much."""
     step = np.zeros(len(term.parameters))
     step[i] = size
     return term.at(term.values + step), term.at(term.values - step)

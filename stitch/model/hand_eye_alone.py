@@ -21,39 +21,41 @@ _STEPS = 3
 
 @dataclass(frozen=True)
 class HandEyeAlone:
-    """The hand-eye at the mean of the effects over the views."""
+    """The single hand-eye that comes closest to a model with effects, averaged over the views."""
 
-    T_mount: Array  # (4, 4)
-    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame, rotation first; the spread of single views in it
-    displacement: float  # length_unit, of the middle of what the views show, from where the model's hand-eye has it
-    spread: float  # length_unit, rms, of the same from view to view
+    T_mount: Array  # (4, 4) maps scanner to mount
+    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame, rotation first; the spread from view to view included
+    displacement: float  # length_unit: how far it puts the middle of the points from where the model's T_mount does
+    spread: float  # length_unit: rms over views of the distance of that middle from where the model's effects put it
 
 
 def hand_eye_alone(measurement: Measurement, model: Model) -> HandEyeAlone | None:
-    """Return the hand-eye at the mean of the effects over the views; None without effects of base, arm or mount.
+    """Return the mean over the views of the hand-eye that each would need without effects of base, arm and mount.
 
-    What began at a view counts as it was in the end.
+    The mean on SE(3), by repeated averages of logarithms. Events count as they are after the last view. None where the
+    model has no such effects, and with several scanners, which have no hand-eye in common.
     """
     places = (*ARM_PLACES, "mount")
     terms = _as_in_the_end([term for term in model.terms if term.effect.place in places and not term.is_geometry])
-    # Several scanners have no hand-eye in common.
     if not terms or measurement.views.scanners:
         return None
     left, right = perturbed_frames(measurement, terms)
     plain, _ = perturbed_frames(measurement, ())
+    # plain · T = left · T_mount · right for the hand-eye T that a view needs without effects.
     of_views = frames.inverse(plain) @ left @ model.T_mount @ right
     T_mount = model.T_mount
     for _ in range(_STEPS):
         T_mount = T_mount @ frames.exp(frames.log(frames.inverse(T_mount) @ of_views).mean(axis=0))
-    apart = frames.log(frames.inverse(T_mount) @ of_views)
+    deviations = frames.log(frames.inverse(T_mount) @ of_views)
     middle = np.mean([points.mean(axis=0) for points in measurement.capture.point_sets if len(points)], axis=0)
 
     def moved(T: Array) -> Array:
+        """Return how far hand-eyes T (..., 4, 4) put the middle of the points from where the mean puts it."""
         return np.linalg.norm(frames.transform(T, middle[None]) - frames.transform(T_mount, middle[None]), axis=-1)
 
     return HandEyeAlone(
         T_mount=T_mount,
-        covariance=model.covariance + apart.T @ apart / len(apart),
+        covariance=model.covariance + deviations.T @ deviations / len(deviations),
         displacement=float(moved(model.T_mount)[0]),
         spread=float(np.sqrt(np.mean(moved(of_views) ** 2))),
     )

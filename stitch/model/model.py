@@ -58,8 +58,7 @@ class Term(Value):
 
     @property
     def sigmas_from_zero(self) -> float:
-        """The largest |value|/sigma of its parameters, for what it is worth among so many; 0 where the views see
-        none."""
+        """The largest |value|/sigma of its fitted parameters, corrected for their number (Bonferroni); 0 of none."""
         sigmas = [abs(p.value) / p.sigma for p in self.parameters if p.fitted and not p.grid]
         return sigmas_among(max(sigmas), len(sigmas)) if sigmas else 0.0
 
@@ -85,7 +84,7 @@ class Term(Value):
 
     @cached_property
     def arguments(self) -> dict[str, Any]:
-        """Keyword arguments of the effect's function."""
+        """Keyword arguments of the effect's function, with these values."""
         return self.effect.arguments(self.parameters)
 
     def at(self, values: Array, sigmas: Array | None = None) -> "Term":
@@ -112,28 +111,30 @@ class EffectsCovariance:
     with_hand_eye: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     def root(self, terms: Sequence[Term]) -> Array:
-        """Return (P, K) L with L·Lᵀ the covariance of all parameters of some terms, zero where nothing is known of one.
+        """Return L (P, K) with L·Lᵀ the covariance of all P parameters of some terms.
 
-        Where the sigma of a parameter is another than the matrix has, its sigma counts, alone.
+        Rows of parameters that were not fitted are zero. A parameter whose sigma differs from that of the matrix, as
+        one that a person edited in model.toml, counts with its own sigma and without correlation.
         """
         rows = [(f"{term.name}.{p.name}", p) for term in terms for p in term.parameters]
         at = {name: k for k, name in enumerate(self.names)}
         sigma = np.sqrt(np.diag(self.matrix))
+        # Index among the parameters, and in the matrix, of those whose sigma is that of the matrix.
         known = [
             (i, at[name])
             for i, (name, p) in enumerate(rows)
             if name in at and p.fitted and abs(p.sigma - sigma[at[name]]) <= _SAME_SIGMA * sigma[at[name]]
         ]
-        together = {i for i, _ in known}
-        alone = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in together]
-        out = np.zeros((len(rows), len(known) + len(alone)))
+        correlated = {i for i, _ in known}
+        single = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in correlated]
+        out = np.zeros((len(rows), len(known) + len(single)))
         if known:
             rows_known = [i for i, _ in known]
             columns = [k for _, k in known]
             size = sigma[columns]
             values, vectors = np.linalg.eigh(self.matrix[np.ix_(columns, columns)] / np.outer(size, size))
             out[rows_known, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        for k, i in enumerate(alone, len(known)):
+        for k, i in enumerate(single, len(known)):
             out[i, k] = rows[i][1].sigma
         return out
 
@@ -201,27 +202,29 @@ class Model(Value):
 
 
 def geometry_terms(measurement: Measurement) -> tuple[Term, ...]:
-    """Return what every model of a session fits beside the hand-eye, at zero: where its axes and
-    further scanners stand."""
+    """Return the terms of tier geometry that every model of a session fits with the hand-eye, at value 0.
+
+    They place external axes and further scanners; () without any. Axes that are used as given are not fitted.
+    """
     axes = measurement.views.axes
     scanners = (term_of(measurement, find_effect(SCANNER_PLACEMENT)),) if measurement.views.scanners else ()
     if not axes:
         return scanners
     term = term_of(measurement, find_effect(PLACEMENT))
     still = {axis.name for k, axis in enumerate(axes.axes) if axis.is_fixed or k == axes.frame_axis}
-    # One that is used as given is held as what another run knows is.
+    # The frame axis is placed by the hand-eye. `kept` parameters are never fitted.
     parameters = [replace(p, kept=p.name.partition("_")[2] in still) for p in term.parameters]
     return (Term(term.effect, tuple(parameters)), *scanners)
 
 
 def term_of(measurement: Measurement, effect: Effect) -> Term:
-    """Return the effect at zero; parameters that are tried value by value in the middle of their grid."""
+    """Return an effect as a term at value 0; parameters that are tried value by value in the middle of their grid."""
     parameters = parameters_in(measurement, effect)
     return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in parameters))
 
 
 def grid_terms(measurement: Measurement, effect: Effect) -> list[Term]:
-    """Return the effect at zero, once for every combination of its gridded parameters."""
+    """Return an effect as terms at value 0, one for every combination of the values that are tried (`grid`)."""
     zero = Term(effect, parameters_in(measurement, effect))
     return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
@@ -242,14 +245,26 @@ def sizes_of(terms: Sequence[Term]) -> Array:
 
 
 def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
-    """Return (P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
+    """Return the sigmas (P,) of all parameters of all terms after a fit.
+
+    Those of the fit for parameters in it; the old ones for parameters kept from another run; NaN for the rest.
+
+    Args:
+        fitted: (P,) True for the K parameters in the fit.
+        sigmas: (K,) of these.
+    """
     out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
     out[fitted] = sigmas
     return out
 
 
 def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
-    """Return the terms with values (P,), and sigmas (P,), of all their parameters in one row."""
+    """Return the terms with other values, in the order of `stack_parameters`.
+
+    Args:
+        values: (P,) of all parameters of all terms.
+        sigmas: (P,) theirs; None: they stay.
+    """
     ends = np.cumsum([len(term.parameters) for term in terms])[:-1]
     values_of_terms = np.split(values, ends)
     sigmas_of_terms = [None] * len(terms) if sigmas is None else np.split(sigmas, ends)
@@ -257,7 +272,7 @@ def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | 
 
 
 def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
-    """Return (P, K) the same root for what another run's arm brought, zero rows for the rest."""
+    """Return L (P, K) with L·Lᵀ the covariance of the parameters kept from another run; rows of all others are zero."""
     kept = np.array([p.kept for term in terms for p in term.parameters], bool)
     root = covariance.root(terms) * kept[:, None]
     return root[:, (root != 0).any(axis=0)]
@@ -272,14 +287,15 @@ def covariance_of_fit(
         fitted: (P,) bool, K of them.
         matrix: (K, K) their covariance.
         kept: (P, L) root of the covariance of those kept: zero rows for the others.
-        with_hand_eye: (6, 6 + K) of the hand-eye with itself and with those fitted; handed on where there are axes.
+        with_hand_eye: (6, 6 + K) covariance of the hand-eye's twist with itself and with those fitted; stored only with
+            terms of tier geometry, whose places depend on both.
     """
     names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
-    whole = kept @ kept.T
-    whole[np.ix_(fitted, fitted)] += matrix
-    known = np.diag(whole) > 0
+    of_all = kept @ kept.T
+    of_all[np.ix_(fitted, fitted)] += matrix
+    known = np.diag(of_all) > 0
     covariance = EffectsCovariance(
-        tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)]
+        tuple(n for n, k in zip(names, known, strict=True) if k), of_all[np.ix_(known, known)]
     )
     if with_hand_eye is None or not any(term.is_geometry for term in terms):
         return covariance
@@ -302,10 +318,10 @@ def printed_covariance(T_mount: Array, covariance: Array) -> Array:
 
 
 def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
-    """Return (n, n) of whatever numbers (n,) a controller writes of a hand-eye, to first order.
+    """Return the covariance (n, n) of the numbers by which a controller states a hand-eye, to first order.
 
     Args:
-        numbers: of a pose (4, 4); near T_mount they must not jump.
+        numbers: function of a pose (4, 4) that returns those numbers (n,), continuous near T_mount.
         T_mount: (4, 4) T_mount_scanner.
         covariance: (6, 6) of the right perturbation, rotation first.
     """
@@ -320,8 +336,14 @@ def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
 
 
 def displacement(covariance: Array, middle: Array) -> float:
-    """Return U (k = 2) of a point (3,) of the scanner's frame under the hand-eye's covariance (6, 6), of all
-    directions."""
+    """Return the expanded uncertainty U (k = 2), length_unit, of the position of a point under a hand-eye.
+
+    The root of the summed variances in all three directions.
+
+    Args:
+        covariance: (6, 6) of the hand-eye's right perturbation, rotation first.
+        middle: (3,) the point, scanner frame.
+    """
     lever = np.hstack([-frames.skew(middle), np.eye(3)])
     return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
 
@@ -335,11 +357,14 @@ def hand_eye_lines(
     unknown: Sequence[str] = (),
     stated: bool = False,
 ) -> list[str]:
-    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner.
+    """Return lines for people: position, mm, and rotation vector, mrad, with U (k = 2), in the mount frame.
 
     Args:
-        unknown: of x, y, z, rx, ry, rz: numbers that the views do not show.
-        stated: such a number is printed as session.toml states it, and else not at all.
+        T_mount: (4, 4) T_mount_scanner, length_unit.
+        covariance: (6, 6) of the right perturbation, rotation first.
+        mount: eye_to_hand | eye_in_hand.
+        unknown: those of x, y, z, rx, ry, rz that the views do not show.
+        stated: session.toml states the hand-eye, whose unknown numbers are then printed; else "not known".
     """
     frame = "base" if mount == "eye_to_hand" else "flange"
     to_mm = METRES[length_unit] * 1e3
@@ -347,6 +372,7 @@ def hand_eye_lines(
     U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
 
     def number(name: str, value: float, u: float) -> str:
+        """Return a number with its U as text, or in words that the views do not show it."""
         if name in unknown:
             return f"{value:.5g} as stated" if stated else "not known"
         return value_uncertainty_text(value, u)
@@ -363,10 +389,10 @@ def hand_eye_lines(
 
 
 def uncertainty_scope(verdict: str | None) -> str:
-    """Return of which model U is: a sigma counts no effect that is missing.
+    """Return a sentence on what U of the hand-eye leaves out: it does not cover an effect that is missing.
 
     Args:
-        verdict: of the diagnosis; None where there is none yet.
+        verdict: of the diagnosis: adequate | missing_effect | cannot_tell | unknown_effect; None: there is none yet.
     """
     if verdict in ("missing_effect", "cannot_tell"):
         return "The ± of the hand-eye are too small until the effect is added."

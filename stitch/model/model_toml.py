@@ -59,7 +59,7 @@ class ModelFile(Value):
 
 
 def write_model(model: ModelFile, path: Path) -> None:
-    """Write `model.toml`, commented, with all digits."""
+    """Write a model as `model.toml` at `path`, with comments on its frames, and all digits of its numbers."""
     carrier = "base" if model.mount == "eye_to_hand" else "flange"
     document = {
         "format": FORMAT,
@@ -97,7 +97,7 @@ def write_model(model: ModelFile, path: Path) -> None:
 
 
 def _parameter_table(p: Parameter) -> dict[str, Any]:
-    """Return the table of a parameter: TOML has a nan, but who reads it expects a word."""
+    """Return the table of a parameter in model.toml; observable = false in place of a sigma that is NaN."""
     known = {"sigma": p.sigma} if p.fitted else {"observable": False}
     return {"value": p.value, **known, "unit": p.unit, **({"kept": True} if p.kept else {})}
 
@@ -155,7 +155,12 @@ def read_model(path: Path | str) -> ModelFile:
 
 @contextmanager
 def _tables(path: Path, name: str, form: str) -> Iterator[None]:
-    """Refuse tables of another form, for which this is left by an error."""
+    """Turn an error in the block that reads tables of model.toml into an InputError of one line.
+
+    Args:
+        name: of the tables.
+        form: how they should look, for the message.
+    """
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
@@ -163,7 +168,11 @@ def _tables(path: Path, name: str, form: str) -> Iterator[None]:
 
 
 def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
-    """Return direction (3,) and point (3,), None where not stated, of each external axis in a table of model.toml."""
+    """Return axis name -> direction (3,) and point (3,), None if not stated, from the tables [axes] of model.toml.
+
+    Raises:
+        InputError: other than three finite numbers each.
+    """
     with _tables(path, "axes", "[axes.table] with direction, point; to fix: three numbers each"):
         axes = {
             str(name): (np.array(t["direction"], float), np.array(t["point"], float) if "point" in t else None)
@@ -175,18 +184,18 @@ def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
 
 
 def with_model_axes(session: SessionData, file: ModelFile) -> SessionData:
-    """Return the session with its axes where a model's placement counts from.
+    """Return the session with its axes placed as in the model: the parameters of axis_placement count from there.
 
     Raises:
-        InputError: an axis that the model does not know, or one of it that the session has not.
+        InputError: session and model have other axes.
     """
-    own, known = [axis.name for axis in session.axes], list(file.axes)
-    if sorted(own) != sorted(known):
+    here, known = [axis.name for axis in session.axes], list(file.axes)
+    if sorted(here) != sorted(known):
         raise InputError(
-            f"{session.path}: its axes are {', '.join(own) or 'none'}, those of the model {', '.join(known) or 'none'}"
+            f"{session.path}: its axes are {', '.join(here) or 'none'}, those of the model {', '.join(known) or 'none'}"
             "; to fix: give both the same [[axis]] tables"
         )
-    if not own:
+    if not here:
         return session
     return place_axes(
         session, [replace(a, direction=file.axes[a.name][0], point=file.axes[a.name][1]) for a in session.axes]
@@ -194,7 +203,9 @@ def with_model_axes(session: SessionData, file: ModelFile) -> SessionData:
 
 
 def with_model_scanners(sessions: Sequence[SessionData], file: ModelFile) -> list[SessionData]:
-    """Return the sessions of several scanners with each where a model's placement counts from.
+    """Return the sessions of several scanners in the model's order, each with the hand-eye that the model states.
+
+    The parameters of scanner_placement count from these.
 
     Raises:
         InputError: a scanner that the model does not know.
@@ -211,7 +222,11 @@ def with_model_scanners(sessions: Sequence[SessionData], file: ModelFile) -> lis
 
 
 def _targets(path: Path, table: Any) -> dict[str, Target]:
-    """Return the targets in a table of model.toml by their names."""
+    """Return target name -> target from the table [targets] of model.toml.
+
+    Raises:
+        InputError: a position that is not three numbers, or an orientation that is not 3×3.
+    """
     targets = {}
     with _tables(path, "targets", "[targets.ball1] with position, sigma; to fix: three numbers each"):
         for name, t in table.items():
@@ -223,7 +238,9 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
 
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
-    """Return the parameters of each effect in a table of model.toml by their names, as they were fitted.
+    """Return effect name -> parameter name -> parameter from the table [effects] of model.toml.
+
+    Only names, units, values and sigmas are read: plausible sizes come with the session (`bind_to_session`).
 
     Raises:
         InputError: a value that is not finite, or a sigma that is none.
@@ -268,8 +285,10 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
 
 
 def without_events(file: ModelFile) -> ModelFile:
-    """Return the model for another session: without effects that begin at one view of its own, whose numbers say
-    nothing of other views; hand-eye and targets where they stand in the end.
+    """Return the model for another session: without effects that begin at one view of its own session, its events.
+
+    What an event of the mount moved is added to the hand-eye, what one of the part moved to the targets, so that both
+    are as after the last view.
 
     Raises:
         InputError: an effect that is not known.
@@ -294,7 +313,7 @@ def _moved_target(target: Target, T: Array) -> Target:
 
 
 def keep_arm_effects(file: ModelFile) -> ModelFile:
-    """Return the model with nothing but the effects of its arm, all of them kept.
+    """Return the model with nothing but the effects of its arm, which other sessions then use and do not fit.
 
     Raises:
         InputError: an effect that is not known, or none of the arm.
@@ -310,7 +329,9 @@ def keep_arm_effects(file: ModelFile) -> ModelFile:
 
 
 def arm_model(file: ModelFile) -> ModelFile | None:
-    """Return the arm's effects of a model, to be kept as they are, without its targets; None without such an effect.
+    """Return the model with the effects of its arm alone, marked `kept`: used as they are, not fitted; without targets.
+
+    None where it has no effect of base, joints or links.
 
     Raises:
         InputError: an effect that is not known.
@@ -324,7 +345,9 @@ def arm_model(file: ModelFile) -> ModelFile | None:
 
 
 def bind_to_session(file: ModelFile, measurement: Measurement) -> Model:
-    """Return the model of a file in a session; a parameter that the file does not name is held at zero.
+    """Return the model that a file states, for a session: with plausible sizes and grids of its effects there.
+
+    A parameter that the file does not name is held at 0.
 
     Raises:
         InputError: an effect that is not known or that the session cannot have, or a parameter that it does not have
@@ -347,7 +370,15 @@ def bind_to_session(file: ModelFile, measurement: Measurement) -> Model:
 def _require_same(
     measurement: Measurement, effect: Effect, stated: dict[str, Parameter], units: dict[str, str]
 ) -> None:
-    """Refuse what a model knows of an effect where this session would have to drop it or read it otherwise."""
+    """Refuse parameters of a model that an effect has not in this session, or has in another unit.
+
+    Args:
+        stated: parameter name -> parameter of the model.
+        units: parameter name -> unit in this session.
+
+    Raises:
+        InputError: names the parameters, and how to make the sessions agree.
+    """
     where = f"session {measurement.capture.name}"
     lost = [name for name in stated if name not in units]
     if lost:
@@ -365,7 +396,7 @@ def _require_same(
 
 
 def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
-    """Return the model with lengths in another unit."""
+    """Return the model with all lengths in another unit, `length_unit`: hand-eye, effects, targets and covariances."""
     if file.length_unit == length_unit:
         return file
     factor = METRES[file.length_unit] / METRES[length_unit]
@@ -401,6 +432,7 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
 
 
 def _rescaled(p: Parameter, old: str, new: str, factor: float) -> Parameter:
+    """Return a parameter with its lengths in unit `new` instead of `old`; `factor` is one `old` in units `new`."""
     power = _power(p.unit, old)
     unit = "/".join(new if part.strip() == old else part for part in p.unit.split("/"))
     return replace(p, unit=unit, value=p.value * factor**power, sigma=p.sigma * factor**power)

@@ -26,7 +26,7 @@ from stitch.effects import (
     twist,
     vector,
 )
-from stitch.effects.contract import PLACES, one_by_one, parameters_in
+from stitch.effects.contract import PLACES, separable_groups, parameters_in
 from stitch.effects.user_file import _KINDS
 from stitch.errors import InputError
 
@@ -124,7 +124,7 @@ def test_no_kind_and_no_pair_of_kinds_ends_a_diagnosis(place, most):
         assert np.isfinite(score(model, candidate).log_bayes_factor), kinds
         assert set(detectable_sizes(model, candidate, 10)) == set(names), kinds
         held = [i for i, p in enumerate(candidate.parameters) if p.grid]
-        groups = one_by_one(own, candidate.parameters)
+        groups = separable_groups(own, candidate.parameters)
         assert {i for group in groups for i in group} >= set(range(len(candidate.parameters))) - set(held), kinds
         assert all(set(group) - set(held) for group in groups), kinds
 
