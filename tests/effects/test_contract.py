@@ -26,7 +26,7 @@ from stitch.effects import (
     twist,
     vector,
 )
-from stitch.effects.contract import PLACES, separable_groups, parameters_in
+from stitch.effects.contract import PLACES, parameters_in, separable_groups
 from stitch.effects.user_file import _KINDS
 from stitch.errors import InputError
 
