@@ -32,7 +32,9 @@ def write_features(document: Mapping[str, Any], path: Path) -> None:
             ],
             "mark": _MARKS[n["conforms"]],
             "budget": [b for b in n["budget"] if b["variance_share"] > 0.005],
-            "told": ", ".join(f"{b['source']} {100 * b['variance_share']:.0f} %" for b in n["budget"][:_SHOWN]),
+            "told": ", ".join(
+                f"{b['source']} {100 * b['variance_share']:.0f} %" for b in n["budget"][:_SHOWN] if n["U"]
+            ),
         }
         for n in document["numbers"]
     ]
@@ -134,8 +136,8 @@ def _write(path: Path, facts: list[tuple[str, str]], **content: Any) -> None:
 
 
 def _rounded(x: float, U: float, sign: str = "") -> str:
-    """A number with as many places as U has with two digits."""
-    places = int(np.clip(1 - np.floor(np.log10(max(U, 1e-12))), 0, 12))
+    """A number with as many places as U has with two digits; four where it is a datum's, which has none."""
+    places = int(np.clip(1 - np.floor(np.log10(U or 1e-3)), 0, 12))
     return f"{x:{sign}.{places}f}"
 
 

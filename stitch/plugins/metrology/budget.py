@@ -144,11 +144,11 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     slopes = aligned @ slopes
     counted = replace(places, sources=_not_stated(places, wanted))
     of_fits, noise = zip(*(counted.loadings(fit.at, fit.gradient) for fit in fits), strict=True)
-    variances, vectors = np.linalg.eigh(slopes @ block_diag(*noise) @ slopes.T)
+    variances, vectors = np.linalg.eigh(block_diag(*noise))
     ends = np.cumsum([source.views.shape[1] for source in counted.sources])[:-1]
     of_sources = np.split(slopes @ np.vstack(of_fits), ends, axis=1)
     rows = [(s.name, loadings, s.degrees) for s, loadings in zip(counted.sources, of_sources, strict=True)]
-    rows.append((OWN_NOISE, vectors * np.sqrt(np.maximum(variances, 0.0)), np.inf))
+    rows.append((OWN_NOISE, slopes @ (vectors * np.sqrt(np.maximum(variances, 0.0))), np.inf))
     rows += [(c.source, aligned @ _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
     covariance = np.sum([loadings @ loadings.T for _, loadings, _ in rows], axis=0)
     by_fit = {fit.feature.name: fit for fit in fits}

@@ -102,7 +102,7 @@ def _show_numbers(measured: MeasuredFeatures) -> None:
 
     title = f"Numbers with U (k = 2), {measured.length_unit} and rad"
     rows = [
-        (n.name, f"{n.value:.5g}", f"{n.value - n.nominal:.2g}", f"{n.U:.2g}", _budget_text(n))
+        (n.name, f"{n.value:.5g}", f"{n.value - n.nominal if n.u else 0.0:.2g}", f"{n.U:.2g}", _budget_text(n))
         for n in measured.numbers
     ]
     if measured.T_datum_reference is not None:
@@ -122,4 +122,4 @@ def _budget_text(n: Number) -> str:
     """The largest sources of a number, and whether it keeps its tolerance."""
     largest = [f"{source} {100 * share:.0f} %" for source, share in list(n.shares.items())[:_SOURCES] if share > 0.05]
     verdict = {True: "; conforms", False: "; does not conform", None: "; U reaches over a limit" if n.limits else ""}
-    return ", ".join(largest) + verdict[n.conforms]
+    return (", ".join(largest) if n.u else "datum") + verdict[n.conforms]

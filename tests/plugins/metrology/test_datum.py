@@ -50,7 +50,7 @@ def test_the_numbers_of_the_datum_are_nominal_and_have_no_U(cell):
     measured, T, _ = measured_in_datum(*cell)
     of_datum = [n for n in measured.numbers if n.name in DATUM]
     assert max(abs(n.value - n.nominal) for n in of_datum) < 1e-6
-    assert max(n.U for n in of_datum) < 1e-6
+    assert max(n.U for n in of_datum) == 0.0
     assert frames.is_rigid(T) and not np.allclose(T, np.eye(4))
 
 
