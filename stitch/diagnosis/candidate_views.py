@@ -23,8 +23,13 @@ _MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
 
 def nearby(driven: Array, chosen: Array | None = None, seed: int = 0) -> Array:
-    """Return (K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits
-    that were kept."""
+    """Return random joint angles (K, n), rad, near given ones: up to `_SAMPLES`, less those beyond the limits.
+
+    Args:
+        driven: (V, n) rad, joint angles of the views; the largest of each joint widens its assumed limit.
+        chosen: (C, n) rad, angles to stay closer to; None: the driven ones.
+        seed: of the draws.
+    """
     rng = np.random.default_rng(seed)
     about, spread = (driven, _SPREAD) if chosen is None else (chosen, _CLOSER)
     joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, driven.shape[1]))
@@ -40,14 +45,17 @@ def reachable(
     chosen: Array | None = None,
     seed: int = 0,
 ) -> Array:
-    """Return (K, n) joint angles in which the scanner sees the part about as it has before.
+    """Return random joint angles (K, n), rad, at which the scanner sees the part about as in the views taken.
+
+    The part's centre has to lie where it lay in the scanner frame before, up to a margin. The viewing direction has to
+    be within 50° of one of the views'.
 
     Args:
-        driven: (V, n) joint angles.
-        poses_of: T_reference_scanner (K, 4, 4) at joint angles (K, n).
-        seen_from: the same (V, 4, 4) of the views that there are.
+        driven: (V, n) rad, joint angles of the views.
+        poses_of: function from joint angles (K, n) to T_reference_scanner (K, 4, 4).
+        seen_from: (V, 4, 4) T_reference_scanner of the views.
         centre: (3,) of what they see, reference frame.
-        chosen: (C, n) joint angles to stay close to.
+        chosen: (C, n) rad, joint angles to stay close to; None: those of the views.
         seed: of the draws.
     """
     joints = nearby(driven, chosen, seed)
@@ -62,11 +70,13 @@ def reachable(
 
 
 def candidate_measurement(measurement: Measurement, joints: Array, wait: Array | float = 0.0) -> Measurement:
-    """Return the measurement with views that nobody has taken yet, right after the last one, each approached from
-    there.
+    """Return a measurement of K views not taken yet, each as if it alone followed the last view; it has no scans.
+
+    Covariates, payload and external axes stay as in the last view, the joints' moves begin there, and the arm rests.
 
     Args:
-        wait: (K,) s by which they come later.
+        joints: (K, n) rad.
+        wait: (K,) or one number, s, beside the usual pause between views.
     """
     assert measurement.robot is not None
     views = measurement.views
@@ -99,7 +109,7 @@ def candidate_measurement(measurement: Measurement, joints: Array, wait: Array |
 
 
 def with_candidates(measurement: Measurement, further: Measurement) -> Measurement:
-    """Return the measurement with candidate views behind its own; without points."""
+    """Return one measurement of the views of both, `further` behind; its capture has poses, but no points."""
     views, more = measurement.views, further.views
 
     def joined(name: str) -> Array:
@@ -126,9 +136,9 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
 
 
 def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
-    """Return the torques at joint angles (K, n), rad, with the last view's payload.
+    """Return the torques at joint angles (K, n), rad, computed by the robot with the last view's payload.
 
-    Where torques were measured, those of the view whose joint angles are nearest.
+    Where torques were measured none are computed: those of the view with the nearest joint angles stand in.
     """
     if views.torques.measured:
         near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
@@ -140,17 +150,20 @@ def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
 def candidate_rows(
     measurement: Measurement, seen: TargetRows, landmarks: Landmarks, terms: Sequence[Term]
 ) -> tuple[TargetRows, list[Array]]:
-    """Return rows of K views in which every target would be seen, and how they answer to `terms`.
+    """Return the linearised rows of K views that would see every known target, and their derivatives by effects.
 
     Args:
-        measurement: of the candidate views.
+        measurement: of the K candidate views.
         seen: rows of the views that were taken.
+        landmarks: positions of the targets and their parameters, in the columns of `seen`.
+        terms: effects, each with P parameters.
 
     Returns:
-        Rows, and one (K, m, P) per term.
+        Rows, m residuals a view, and for each term (K, m, P): change of the residuals per unit of each parameter.
     """
     known = np.flatnonzero(np.isfinite(landmarks.positions).all(axis=1))
     measurement = _all_seen(measurement, seen, landmarks, known)
+    # Without a drawing; its parameters still need columns, of zeros, so that both kinds of rows have the same.
     undrawn = replace(landmarks, drawing=None, T_reference_part=None)
     rows = target_rows(measurement.capture, seen.T_mount, undrawn)
     unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
@@ -159,7 +172,13 @@ def candidate_rows(
 
 
 def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:
-    """Return the measurement with sightings of all known targets, as good as those that were seen."""
+    """Return the measurement of candidate views with sightings of all known targets, as precise as those seen so far.
+
+    Args:
+        seen: rows of the views that were taken: hand-eye, and sigmas of which the median is taken.
+        landmarks: the targets, reference frame.
+        known: indices of the targets whose position is known.
+    """
     before = seen.sightings
     K = len(measurement.T_base_flange)
     bare = build_capture("candidates", (), measurement.T_base_flange, measurement.mount)

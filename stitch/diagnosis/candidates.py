@@ -86,10 +86,16 @@ class Candidate:
 
 
 def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
-    """Return physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones
-    lack."""
+    """Return all effects that could be missing in the model as candidates, and what unavailable effects lack.
+
+    Args:
+        empirical: include shapes without a physical cause.
+
+    Returns:
+        Candidates; and by name of an effect that cannot be tested, the data that it needs.
+    """
     in_use = [term.name for term in linear.model.terms]
-    # What holds still is asked nothing, and of axes nobody is told who has none.
+    # Effects that cannot arise here, as of external axes where there are none, are neither tried nor reported.
     views = linear.measurement.views
     library = of_each_scanner(views, EFFECTS.values())
     library = [e for e in library if e.name not in in_use and is_asked(linear.measurement, e)]
@@ -97,6 +103,7 @@ def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Can
     effects = [e for e in library if e.name not in missing]
     shapes = of_each_scanner(views, empirical_effects(views)) if empirical else []
     effects += [e for e in shapes if not missing_need(linear.measurement, e)]
+    # A term for each value of an effect's grid; all responses are computed in one pass over the points.
     terms_of = [grid_terms(linear.measurement, effect) for effect in effects]
     responses = iter(linear.responses([term for terms in terms_of for term in terms]))
     tried = [_build_candidate(linear, terms, [next(responses) for _ in terms]) for terms in terms_of]
@@ -122,9 +129,11 @@ def candidate_as_fitted(linear: LinearModel, term: Term) -> Candidate:
 
 
 def free_masks(term: Term) -> list[Mask]:
-    """Return (P,) parameters that are free in each form of an effect: all together, then those that can be true alone.
+    """Return a mask (P,) of free parameters for each form of an effect: first all of them, then parts of them.
 
-    Those of one joint, or all but an offset; links in single numbers too, and shapes over points in these.
+    Parts are tried since few parameters explain more credibly than many. They are the parameters of one joint, or all
+    without a constant offset; of links also each alone, and of empirical shapes of the sensor each alone. Gridded
+    parameters are never free. Parts that are empty, or equal to the whole, are left out.
     """
     effect, parameters = term.effect, term.parameters
     if effect.tier == "empirical" and effect.place == "sensor":
@@ -139,10 +148,11 @@ def free_masks(term: Term) -> list[Mask]:
 
 
 def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
-    """Return the candidate of terms of one effect, a term for each value of its grid; None where nothing is free in it.
+    """Return one effect as a candidate with all its forms; None where it has no free parameter.
 
     Args:
-        responses: of the observation to the parameters of each term.
+        terms: of the effect, one for each value of its grid.
+        responses: change of the observation per unit of each parameter, one for each term.
     """
     forms = list[Form]()
     for term, response in zip(terms, responses, strict=True):

@@ -59,7 +59,11 @@ class Dependence:
 
 
 def equally_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
-    """Return the clearest covariate and those that explain the displacements as well; () where nothing is clear."""
+    """Return the dependences whose p is at most 20 times the least; () where not even the first is clear.
+
+    Args:
+        followed: the clearest first.
+    """
     return tuple(x for x in followed if x.clear and x.p_value <= _AS_WELL * followed[0].p_value)
 
 
@@ -71,12 +75,16 @@ def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
 def dependences(
     linear: LinearModel, named: Sequence[Ranked] = (), dictionary: Dictionary | None = None
 ) -> tuple[Dependence, ...]:
-    """Return what the displacements of whole views follow, clearest first; () where too few numbers are free.
+    """Return the covariates on which the displacements of whole views depend, by their best law, clearest first.
+
+    Every covariate is listed once, significant or not. The result is () where no law can be tested.
 
     Args:
-        named: effects that are said to be missing: of columns that are one in these views, theirs is listed alone.
-        dictionary: of these views, where it is known.
+        named: effects that are said to be missing. Of covariates that are equal in these views, the one of a named
+            effect is listed alone.
+        dictionary: laws of these views; None: they are built here.
     """
+    # Poses scatter independently here: random effects of joints would absorb what is sought.
     linear = linear.restricted(())
     laws = [law for law in (dictionary or dictionary_of(linear)).laws if law.is_whole]
     if not laws:
@@ -86,6 +94,7 @@ def dependences(
     p_values = np.ones(len(laws))
     p_values[clearest] = _p_values(linear, list(columns.values()))
     twins = _twins_of_followed(linear, laws, named)
+    # The law with the least p of each covariate, in the order of p.
     best: dict[str, int] = {}
     for k in sorted(clearest, key=lambda k: (p_values[k], k)):
         if laws[k].driver.name not in twins:
@@ -95,7 +104,7 @@ def dependences(
         zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
     )
     displacement = linear.view_displacements()
-    tried = len(laws)  # each is the likeliest of all of them
+    tried = len(laws)  # Bonferroni: each law was chosen among all
     return tuple(
         _dependence(linear, laws[k], columns[k], displacement, tried * p_values[k], tried * beside.get(k, 1.0))
         for k in best.values()
@@ -103,7 +112,11 @@ def dependences(
 
 
 def _may_be_clearest(linear: LinearModel, laws: Sequence[Law]) -> list[int]:
-    """Return the few laws of each covariate that explain most, as if all scatter were known alike."""
+    """Return the indices of the laws of each covariate with the least p, at most `_ASKED_OF_EACH` of each.
+
+    This is a quick F test with the same degrees of freedom for all laws; `_p_values` then tests these few exactly. For
+    a law with columns X, the explained square is bᵀ (Xᵀ X)⁺ b, b = Xᵀ y, by the eigenvalues of Xᵀ X that are not zero.
+    """
     known = max(linear.mixed.size - linear.design.shape[1], 1)
     by_driver: dict[str, list[tuple[float, int]]] = {}
     for place, shapes, index in stacked(laws):
@@ -146,10 +159,10 @@ def _twins_of_followed(linear: LinearModel, laws: Sequence[Law], named: Sequence
 
 
 def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:
-    """Return the chance of what each of some columns (n, k) explains.
+    """Return the p-value of each matrix of columns (n, k), k depending on the law, by an F test.
 
-    That of the clearest is under the scatter that is left beside them: what views follow counts as scatter as long as
-    it is not taken out, and hides itself.
+    The least ones are computed again with variances of the scatter fitted beside these columns. Otherwise the error
+    that they explain would count as scatter, and make itself look insignificant.
     """
     p_values = [_p_value(linear, x) for x in columns]
     refitted = _REFITTED if linear.mixed.size <= _FEW_NUMBERS else _REFITTED_OF_MANY
@@ -160,7 +173,11 @@ def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:
 
 
 def _p_value(linear: LinearModel, columns: Array) -> float:
-    """Return the chance of what columns (n, k) explain, of a scatter that is known to so many degrees of freedom."""
+    """Return the p-value of columns (n, k): an F test of the whitened residual's projection on them.
+
+    F = |Uᵀ r|² / rank, U an orthonormal basis of the whitened columns beside hand-eye and effects in use. The degrees
+    of freedom of the scatter follow Satterthwaite. 1 where the columns add nothing to the model.
+    """
     white = linear.residual(columns)
     U = column_space(white) if np.abs(white).max(initial=0.0) > _NOTHING else white[:, :0]
     if not U.shape[1]:
@@ -170,7 +187,10 @@ def _p_value(linear: LinearModel, columns: Array) -> float:
 
 
 def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
-    """Return the model with the combinations of columns (n, k) that it does not explain itself."""
+    """Return the linear model with columns (n, k) as further unknowns of any size, its variances fitted again.
+
+    Only combinations that are new beside the model are added: the others would make it singular.
+    """
     white = linear.residual(columns)
     length = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
     _, s, turned = np.linalg.svd(white / length, full_matrices=False)
@@ -182,8 +202,16 @@ def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
 def _dependence(
     linear: LinearModel, law: Law, columns: Array, displacement: Array, p_value: float, p_beside: float
 ) -> Dependence:
-    """Return the bins of one law along the direction in which what it explains is largest."""
+    """Return the result for one law: bins of the displacement along the direction in which it moves the part most.
+
+    Args:
+        columns: (n, k) of the law in the reduced observations, at plausible sizes.
+        displacement: (V, 3) of each view at the part, reference frame, length_unit.
+        p_value: over all laws.
+        p_beside: the same beside the clearest covariate.
+    """
     white = linear.residual(columns)
+    # What the law explains, less what a refitted hand-eye and the effects in use take up of it.
     moved = columns @ fit_columns(white, linear.white_residual)
     held = linear.reduce(linear.design) @ fit_columns(linear.white_design, linear.whiten(moved[:, None])[:, 0])
     direction = np.linalg.svd(linear.observation.part_displacements(moved - held), full_matrices=False)[2][0]
@@ -215,13 +243,19 @@ def _dependence(
 def bin_means(
     x: Array, y: Array, bins: int = DEPENDENCE_BINS, split: float | None = None
 ) -> tuple[Array, Array, Array]:
-    """Return middle, mean and standard error of y in bins of x with equal counts, or on both sides of a split; views
-    are the samples."""
+    """Return middle, mean and standard error (B,) of values in bins of equal counts, or on both sides of a split.
+
+    Args:
+        x, y: (V,) abscissa and value of each view, in any units.
+        bins: number of bins; fewer for fewer than two views a bin.
+        split: x at which to divide in two instead; None: bins of equal counts.
+    """
     order = np.argsort(x, kind="stable")
     if split is None:
         parts = [part for part in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(part)]
     else:
         parts = [order[x[order] < split], order[x[order] > split]]
+    # Bins of one or two views have no scatter of their own to speak of: that of all stands in.
     spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
     middle = np.array([x[part].mean() for part in parts])
     mean = np.array([y[part].mean() for part in parts])

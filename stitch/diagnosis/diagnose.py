@@ -52,10 +52,10 @@ def linear_model_of(state: RunData) -> LinearModel:
 
 
 def _diagnose(state: RunData) -> Diagnosis:
-    """Return the diagnosis of a run: which effect is missing, if one is, what else could be, and whence the rest comes.
+    """Return the diagnosis of a run: verdict, candidates, and where the remaining error comes from.
 
-    First the evidence decides the verdict; then every candidate is described; then errors without a name are sought,
-    since what is said of the scatter depends on them.
+    The order matters: the evidence decides the verdict, then every candidate is described. Last, repeating errors
+    without a name are sought where the verdict is unknown_effect: the scatter of the poses is stated beside them.
     """
     announce("diagnosing: what every view tells of its pose")
     linear = linear_model_of(state)
@@ -73,10 +73,10 @@ def _diagnose(state: RunData) -> Diagnosis:
         repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.told_laws[:1]))
     reported = reportable(repeating, evidence.implausible_scatter)
     process = reported[0].process if reported else None
-    # The joint that is said to err without a name may err so.
+    # The model in which the joint that is reported may err without a name, so that this error is no scatter.
     joint_effects = reported[0].joint_effects if reported else ()
     with_reported = joint_effects[0].model if joint_effects else linear
-    # Of the poses beside errors said to repeat, or else all of it.
+    # The scatter beside the repeating errors that are reported; without such, all pose errors together.
     scattering = with_reported if reported else linear.restricted(())
     scatter = process.flange_scatter if process else scattering.flange_scatter(scattering.null)
     rotation, translation = np.sqrt(scatter).tolist()
@@ -123,15 +123,20 @@ def _diagnose(state: RunData) -> Diagnosis:
 
 
 def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, tests: int) -> list[CandidateEffect]:
-    """Return every candidate with what it would leave on views left out, what looks like it, and its detectable sizes.
+    """Return every candidate with its cross-validation, its aliases and the smallest sizes that would show.
 
-    Those that are not among what may be named are asked alone.
+    Effects that may be named have been cross-validated already; of the others the first `CROSS_VALIDATED_CANDIDATES`
+    are, each alone.
+
+    Args:
+        matrix: (K, K) alias matrix of the K candidates, in the order of `evidence.ranked`.
+        tests: number of effects among which one is chosen.
     """
     scores = [r.score for r in evidence.ranked]
     response = hand_eye_response(linear)
 
     def examined(k: int) -> CandidateEffect:
-        """Return candidate k with aliases, smallest detectable sizes, and what it does to hand-eye and shape unseen."""
+        """Return the description of candidate k; threads run it for several k at once."""
         scored = scores[k]
         detectable = detectable_sizes(linear, scored.candidate, tests)
         validation = evidence.left_out.get(scored.name)
@@ -150,14 +155,17 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
 
 
 def _named_together(evidence: Evidence) -> tuple[str, ...]:
-    """Return the effects that are missing at once, the one that is named first; else those that are named."""
+    """Return the effects that are missing side by side, the named one first; otherwise the effects that are named."""
     named = tuple(r.name for r in evidence.named)
     together = tuple(r.name for r in evidence.together)
     return together if evidence.verdict == "missing_effect" and together[:1] == named else named
 
 
 def _pair_beside_each_other(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Ranked] | None:
-    """Return two effects that are missing, each scored beside the other; of many views they were chosen so."""
+    """Return two effects that are both missing, each scored with the other in the model; None unless two are.
+
+    With many views the selection has scored them so already.
+    """
     if evidence.second is None:
         return None
     first = evidence.named[0]

@@ -61,16 +61,19 @@ ARTEFACTS = {
 
 
 def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
-    """Return what would tell the named group apart; without a group, the clearest candidate from what resembles it.
+    """Return what to measure next, by the verdict: views that decide, and reference objects to measure (artefacts).
 
-    Of errors without a name: the view where least is known of them.
+    cannot_tell: what separates the group that is named. missing_effect: what separates the name from its best alias.
+    unknown_effect: the same for effects that come close; without such, the view where least is known of the error.
+    Empty where there is nothing to separate.
     """
     with library_threads_off():
-        group = _effects_to_separate(diagnosis)
-        names = tuple(ranked.name for ranked in group)
+        to_separate = _effects_to_separate(diagnosis)
+        names = tuple(ranked.name for ranked in to_separate)
         artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
-        rivals = [*group, *_others_near(diagnosis, group)] if group else []
-        undecided = len(group) if diagnosis.verdict == "cannot_tell" else 0
+        rivals = [*to_separate, *_others_near(diagnosis, to_separate)] if to_separate else []
+        # So many of the rivals, the first, have no winner yet; the others could only catch up.
+        undecided = len(to_separate) if diagnosis.verdict == "cannot_tell" else 0
         views = deciding_views(diagnosis.linear, rivals, undecided=undecided)
         if views is not None:
             return (*_poses(diagnosis.linear, names, views), *artefacts)
@@ -79,13 +82,16 @@ def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
 
 
 def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
-    """Return the group that was named, what a joint without a law explains as well, or the best candidate and its
-    nearest alias; else nothing."""
+    """Return the effects that further views should tell apart; empty where there are none.
+
+    They are the group of a cannot_tell, or the contenders where a joint without a law explains the views as well, or
+    the effect that is named and its nearest alias.
+    """
     if len(diagnosis.named) > 1:
         return list(diagnosis.named)
     unmodelled = does_an_unmodelled_effect_explain_it.__name__
     if diagnosis.verdict == "unknown_effect" and any(a.name == unmodelled and a.changed for a in diagnosis.answers):
-        # Beside all errors that remain: laws of no effect, which the odds do not hold, weigh as much.
+        # As they rank beside all pose errors that remain. Laws without an effect weigh as much; no odds include them.
         return [c.ranked for c in diagnosis.candidates if is_contender(c.ranked)][:_OTHERS]
     fitted = [c.ranked for c in diagnosis.candidates if c.ranked.score.observable and c.ranked.score.fitted]
     likeliest = fitted[:_LIKELIEST]
@@ -97,22 +103,30 @@ def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
     return [first, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
 
 
-def _others_near(diagnosis: Diagnosis, group: list[Ranked]) -> list[Ranked]:
-    """Return the likeliest other effects of poses: one that is behind now may be ahead after a further view."""
+def _others_near(diagnosis: Diagnosis, to_separate: list[Ranked]) -> list[Ranked]:
+    """Return up to `_OTHERS` further effects of poses within `_NEAR` nats: a further view may put one of them ahead.
+
+    Args:
+        to_separate: effects that are rivals already; not empty.
+    """
     rows = {c.name: c.ranked for c in diagnosis.candidates}
-    # What is named was scored where none of its rivals is among the errors.
-    higher = group[0].log_posterior - rows[group[0].name].log_posterior
-    least = max(ranked.log_posterior for ranked in group) - _NEAR - higher
+    # The effects to separate may be scored in another model than the table: log posteriors are shifted to theirs.
+    higher = to_separate[0].log_posterior - rows[to_separate[0].name].log_posterior
+    least = max(ranked.log_posterior for ranked in to_separate) - _NEAR - higher
     others = [
         replace(ranked, log_posterior=ranked.log_posterior + higher)
         for name, ranked in rows.items()
-        if ranked.score.fitted and ranked.log_posterior > least and name not in {r.name for r in group}
+        if ranked.score.fitted and ranked.log_posterior > least and name not in {r.name for r in to_separate}
     ]
     return [ranked for ranked in others if not moves_points([ranked.score.form.term])][:_OTHERS]
 
 
 def _poses(linear: LinearModel, names: tuple[str, ...], views: DecidingViews) -> tuple[Proposal, ...]:
-    """Return a proposal for each view, in the order in which they are taken."""
+    """Return a proposal for each view that decides, in the order in which they are to be taken.
+
+    Args:
+        names: effects that the views separate.
+    """
     proposals = []
     for k, (joints, wait, probability) in enumerate(zip(views.joints, views.wait, views.probability, strict=True)):
         what = "take a view near" if k == 0 else "then another near"
@@ -123,8 +137,11 @@ def _poses(linear: LinearModel, names: tuple[str, ...], views: DecidingViews) ->
 
 
 def least_known_view(diagnosis: Diagnosis) -> Proposal | None:
-    """Return the view where least is known of an error without a name that follows something; None where it follows
-    nothing that a view can be taken at."""
+    """Return the view that would show most of an error without a name: where no view lies near along its covariate.
+
+    Among reachable poses it is the one farthest from all views in the angle of the joint that the error follows. Along
+    time or another covariate it is the first view again. None where the error follows nothing of that kind.
+    """
     linear = diagnosis.linear
     views = linear.measurement.views
     if diagnosis.curves:
@@ -168,6 +185,7 @@ def angles_text(joints: Array) -> str:
 
 
 def _pose(linear: LinearModel, do: str, names: tuple[str, ...], joints: Array) -> Proposal:
+    """Return the proposal of one view at joint angles (n,), rad; T_base_flange is that of the rounded angles."""
     assert linear.measurement.robot is not None
     degrees = [round(float(x), 2) for x in np.degrees(joints)]
     T = forward(linear.measurement.robot, np.radians(degrees))

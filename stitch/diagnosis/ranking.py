@@ -51,16 +51,19 @@ class Ranked:
         return self.log_posterior - self.log_belief
 
     def comes_near(self, best: "Ranked") -> bool:
-        """Return whether the best is less than 20 to 1 likelier, by the posterior or by what the views alone say.
+        """Return whether the best effect is less than 20 to 1 likelier, with or without the prior of how common it is.
 
-        How often effects are met is a judgement: it orders those that explain as much, and takes none out of them.
+        That prior is a judgement: it may order effects that explain equally much, but exclude none of them.
         """
         behind = min(best.log_posterior - self.log_posterior, best.log_evidence - self.log_evidence)
         return behind < limits.ODDS
 
 
 def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
-    """Return all candidates scored and ranked among each other; those that these views cannot show are no tests."""
+    """Return physical and empirical candidates, scored and ranked, best first.
+
+    The number of tests is the sum of the priors of observable physical effects: rare ones count as a part of a test.
+    """
     scores = list(parallel(partial(score, linear), candidates, "candidate effects"))
     beliefs = [s.candidate.effect.prior for s in scores if s.observable and not s.candidate.empirical]
     return rank(scores, round(sum(beliefs)))
@@ -76,11 +79,14 @@ def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array
 
 
 def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
-    """Return physical and empirical candidates, best first; posterior shares among all and nothing.
+    """Return physical and empirical candidates with p-values and posteriors, best first.
+
+    The log posterior is log BF + log prior; probabilities are over all candidates and that nothing is missing. Physical
+    effects share one prior, weighted by how common they are, and empirical shapes another. The p-value is multiplied by
+    the number of tests of its kind (Bonferroni).
 
     Args:
-        tests: physical candidates among which these were chosen, scored here or not: all of them count in the
-            family-wise p-value and share the prior.
+        tests: number of physical candidates among which these were chosen, scored here or not.
     """
     physical = [s for s in scores if not s.candidate.empirical]
     empirical = [s for s in scores if s.candidate.empirical and s.observable]
@@ -93,7 +99,7 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
         Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)), family)
         for (s, _, family), log in zip(weighted, logs, strict=True)
     ]
-    # Where there is nothing to tell them apart, by name, so that the order of a list decides nothing.
+    # Ties are ordered by name: the order of the library decides nothing.
     ranked.sort(
         key=lambda r: (not r.score.observable, -round(r.log_posterior, 6) if r.score.observable else 0.0, r.name)
     )
@@ -101,8 +107,10 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
 
 
 def too_large(named: Sequence[Ranked]) -> tuple[str, ...]:
-    """Return the parameters of what is named that are larger than is believed of them; of a group only where each of
-    its effects has such."""
+    """Return the parameters of the first named effect that are implausibly large; () unless every one has such.
+
+    Of a group that cannot be told apart, one effect of believable size is enough to be believed.
+    """
     names = list[list[str]]()
     for scored in (r.score for r in named):
         fitted = zip(scored.form.free, scored.values, scored.sigmas, strict=True)
@@ -116,17 +124,22 @@ def beyond_belief_text(names: Sequence[str]) -> str:
 
 
 def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
-    """Return the ranking where something else has this log posterior beside `best`: all shares make room."""
+    """Return the ranking with posteriors reduced for a further hypothesis, so that all add up to 1 again.
+
+    Args:
+        best: candidate in the model in which the hypothesis was scored.
+        log_posterior: of the hypothesis, in that model; its odds over `best` are carried over to the ranking.
+    """
     share = next(r for r in ranked if r.name == best.name).posterior
     room = 1 + share * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
     return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
 
 
 def is_contender(ranked: Ranked) -> bool:
-    """Return whether an effect may be named: physical, shown by these views, significant, and likelier than none.
+    """Return whether an effect may be named: physical, observable, significant, and with a Bayes factor over 1.
 
-    Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
-    does not know how many were tried.
+    A p-value alone ignores how little a small effect with many parameters explains; a Bayes factor alone ignores how
+    many effects were tried.
     """
     scored = ranked.score
     significant = ranked.physical and scored.observable and ranked.adjusted < limits.ALPHA_NAME
@@ -140,26 +153,28 @@ def is_certain(ranked: Ranked) -> bool:
 
 def stands_out(ranked: Ranked) -> bool:
     """Return whether a shape without a cause is enough for an alarm."""
-    # Laws of the dictionary and other shapes, two families.
+    # Bonferroni over two families of such shapes: laws of the dictionary, and empirical effects.
     return ranked.adjusted < 0.5 * limits.ALPHA_UNKNOWN and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
 
 def conditioned_without(
     linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, start: Array | None = None
 ) -> LinearModel:
-    """Return the evidence beside all effects but one.
+    """Return the linear model with the chosen effects as further unknowns, all but `one`.
 
     Args:
-        start: of `conditioned_on`.
+        start: (c,) variances at which their fit begins; None: as for `conditioned_on_effects`.
     """
     return conditioned_on_effects(linear, [r for r in chosen if r.name != one.name], start)
 
 
 def conditioned_on_effects(linear: LinearModel, chosen: Sequence[Ranked], start: Array | None = None) -> LinearModel:
-    """Return the evidence beside some effects.
+    """Return the linear model with the chosen effects as further unknowns, with priors of their plausible sizes.
+
+    A candidate that is scored in it is asked what it explains beside them. Without effects, the model itself.
 
     Args:
-        start: of `conditioned_on`; None: as the last of the effects was found, beside the others.
+        start: (c,) variances at which their fit begins; None: those of the fit with the last of the effects.
     """
     if not chosen:
         return linear
