@@ -86,12 +86,14 @@ class CoarseHandEye:
     _met: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def overlaps(self, capture: Capture) -> Overlaps:
-        """Return what a few points of each view meet under it: the stage shows it, and the correction begins with it.
+        """Return the correspondences of a few points of each view under this hand-eye.
+
+        Two callers want them, the report of the coarse stage and the correction: the first call caches them, the second
+        takes them out of the cache.
 
         Raises:
             NoResultError: no two views overlap.
         """
-        # The second who asks takes it along: nobody asks a third time.
         known, overlaps = self._met.pop(id(capture), (None, None))
         if overlaps is None or known is not capture:
             samples = common_samples(capture.scans, COARSE_SAMPLES)
@@ -111,16 +113,19 @@ class CoarseHandEye:
 
 
 def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
-    """Return a hand-eye that is known from elsewhere as the start: the gate is wide enough for 5° and 30 mm.
+    """Return a known hand-eye as the start of the correction, with a gate wide enough for errors of 5° and 30 mm.
 
     Args:
-        source: where from, in words.
+        T_mount: (4, 4) maps scanner to mount.
+        source: where it comes from, in words.
     """
     return CoarseHandEye(T_mount, COARSE_GATE * part_size(captures), source, ())
 
 
 def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
-    """Return the hand-eye that a search finds.
+    """Return the hand-eye that a search from many starts finds, and the distinct answers, best first.
+
+    Each start is improved by ICP on few points; the answers are ranked by how well all views then meet.
 
     Raises:
         NoResultError: fewer than three views, or no candidate makes the views overlap.
@@ -135,14 +140,15 @@ def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
-    # Starts were turned about the part, which carries the scanner along: a shift that nothing shows ends at zero.
+    # Some starts are rotated about the part, which also shifts the scanner. Along directions that no motion shows, such
+    # a shift would stay.
     tried = [replace(c, T_mount=_without_hidden_shift(captures, c.T_mount)) for c in tried]
     answers = distinct_hand_eyes(captures, tried, size)
     return CoarseHandEye(answers[0].T_mount, _FOUND_GATE * size, answers[0].source, tuple(answers))
 
 
 def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
-    """Return the hand-eye (4, 4) with no shift along what the motions leave open."""
+    """Return the hand-eye (4, 4), its translation zero along directions that the motions do not show."""
     hidden = T_mount[:3, :3] @ hidden_translations(captures, T_mount)
     T = T_mount.copy()
     T[:3, 3] -= hidden @ (hidden.T @ T[:3, 3])
@@ -150,10 +156,14 @@ def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
 
 
 def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
-    """Return distinct starting hand-eyes with the name of the idea behind each.
+    """Return starting hand-eyes T_mount (4, 4), each with the name of how it was found.
 
-    Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
-    the runner-up is.
+    In this order: three that bring the centroids of the clouds together; the best of these rotated by `_RESTART_DEG`
+    about each axis, and by 90°, 180° and 270° about the line of sight; distinct ones from motions of the scans. The
+    quarter turns are usually wrong: how much worse they score says how clear the answer is.
+
+    Args:
+        size: of the part, length_unit.
     """
     centroids = centroid_hand_eyes(captures)
     starts = [("centroids", T) for T in centroids[:3]]
@@ -173,9 +183,14 @@ def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[
 def icp_from_starts(
     captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float
 ) -> list[HandEyeCandidate]:
-    """Return where the hand-eye ends from every start on few points; starts under which no views overlap are dropped.
+    """Return the hand-eyes where ICP ends from every start, with their scores, on few points of each scan.
 
-    Half way, starts that have met go on as one: most end in the same place.
+    After `_STEPS_TO_MEET` steps, starts that have reached the same hand-eye are merged into one, since most end alike.
+    A start under which no views overlap is dropped.
+
+    Args:
+        starts: (name, T_mount (4, 4)).
+        size: of the part, length_unit.
     """
     light = [replace(c, scans=tuple(subsample(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
     met: list[tuple[list[str], Array, list[float]]] = []
@@ -199,7 +214,11 @@ def icp_from_starts(
 def _icp_steps(
     captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], steps: int
 ) -> tuple[Array, list[float]] | None:
-    """Return hand-eye and gates to go on with after some steps; None if no views overlap."""
+    """Return the hand-eye (4, 4) and the next gate of each capture after some steps of ICP; None if no views overlap.
+
+    Args:
+        gates: per capture the largest distance between corresponding points at first, length_unit.
+    """
     try:
         T_mount, overlaps, _ = icp_hand_eye(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
     except NoResultError:
@@ -210,7 +229,14 @@ def _icp_steps(
 def distinct_hand_eyes(
     captures: Sequence[Capture], tried: Sequence[HandEyeCandidate], size: float
 ) -> list[HandEyeCandidate]:
-    """Return distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
+    """Return one candidate per distinct hand-eye, best score first.
+
+    Candidates that place the part alike form a group: it keeps its best hand-eye, the name of its first start, and the
+    number of starts.
+
+    Args:
+        size: of the part, length_unit.
+    """
     groups: list[list[HandEyeCandidate]] = []
     for candidate in tried:
         for group in groups:
@@ -227,7 +253,11 @@ def distinct_hand_eyes(
 
 
 def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> bool:
-    """Return whether two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
+    """Return whether two hand-eyes (4, 4) place the part alike: its points differ by less than 3 % of its size.
+
+    Args:
+        size: of the part, length_unit; its points are six about the mean centroid of the scans.
+    """
     centre = scanner_centre(captures)
     corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
     displacement = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
@@ -235,9 +265,10 @@ def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Arr
 
 
 def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
-    """Return the root mean square distance of points to every other view, truncated at `limit`.
+    """Return the rms over all ordered pairs of views of the distance from points of one to the other, length_unit.
 
-    Views that fail to meet count with the limit, so falling apart cannot pay.
+    A distance above `limit`, or to a surface that faces another way, counts as `limit`: a hand-eye under which views do
+    not meet scores no better than one under which they miss.
     """
     squares: list[float] = []
     for c in captures:
@@ -245,8 +276,12 @@ def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) 
         samples = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
         queries = neighbour_queries(c.scans, poses, samples)
 
+        # The default argument binds the queries of this capture.
         def mean_squares(w: int, queries: NeighbourQueries = queries) -> list[float]:
-            """Return the mean square distance (length_unit²) of each other view's samples to view w, in their order."""
+            """Return, for each other view that has samples, the mean of their squared distances to view w.
+
+            In length_unit²; a distance without a partner that faces the same way counts as `limit`.
+            """
             parts = [(v, slice(None)) for v in range(len(queries.scans)) if v != w and len(queries.index[v])]
             if not parts:
                 return []
@@ -265,12 +300,13 @@ def scanner_centre(captures: Sequence[Capture]) -> Array:
 
 
 def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
-    """Return hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
+    """Return distinct hand-eyes T_mount (4, 4) that bring the centroids of a capture's clouds to one point, best first.
 
-    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
+    Least squares from `_STARTS` random rotations; results within 3° of a better one are dropped. The centroid of a view
+    is biased to the side that it sees, so errors of 2–17° and 20–60 mm are usual.
     """
     centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
-    # A shift that moves all views alike has a column of zeros but for rounding: along it the start stays at zero.
+    # A translation that moves all views alike changes no residual: there it stays zero.
     hidden = hidden_translations(captures, np.eye(4))
     shifts = null_space(hidden.T) if hidden.size else np.eye(3)
 
@@ -308,13 +344,17 @@ def turn_about(rotation: Array, centre: Array) -> Array:
 
 
 def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
-    """Return (source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
+    """Return (source, T_mount (4, 4)) per kind of scan motion and solver of A·X = X·B.
+
+    A are motions of the mount, B of the scanner. A kind with fewer than `_MINIMUM_MOTIONS` plausible motions, and a
+    solver that fails, are left out.
+    """
     out: list[tuple[str, Array]] = []
     for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
         robot, scanner = [], []
         for capture in captures:
             A, B = motions(capture)
-            # Single motions may be wrong: one counts only if it turns by as much as the robot's, as under any hand-eye.
+            # Under any hand-eye both turn by the same angle: a motion that does not is a wrong registration.
             keep = angle_differences(A, B) < _ANGLE_TOLERANCE
             robot.append(A[keep])
             scanner.append(B[keep])
@@ -341,7 +381,11 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
 
 
 def register_pairs(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Return (M, 4, 4) motions of the scanner by feature matching, from the second view's frame into the first's."""
+    """Return motions (M, 4, 4) of the scanner: each maps the second view's scanner frame into the first's.
+
+    Surfaces are matched by FPFH features and RANSAC, then improved by ICP. `size` is the length, in length_unit, to
+    which radii of features and distances are scaled.
+    """
     size = _FEATURE_SPACINGS * capture.spacing
 
     def described(scan: Scan) -> FeaturedSurface:

@@ -36,7 +36,9 @@ _ALIKE = 3
 def locate_axes(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement]
 ) -> tuple[list[SessionData], list[Measurement]]:
-    """Return sessions and measurements with axes placed that nobody has stated; all as they are where none is missing.
+    """Return sessions and measurements in which every external axis has a place: unstated ones found from the scans.
+
+    The axes are found in the first session and used in all. Where all are stated, nothing is changed.
 
     Raises:
         InputError: there are no clouds, or sessions differ in what they state.
@@ -57,6 +59,7 @@ def locate_axes(
 
 
 def _placed(session: SessionData, measurement: Measurement) -> Measurement:
+    """Return the measurement with its scans on the poses of the session, whose axes are placed now."""
     capture = measurement.capture
     T = np.array([view.T_base_flange for view in session.views])
     placed = build_capture(capture.name, capture.scans, T, session.mount, capture.sightings)
@@ -75,7 +78,11 @@ class _Motions:
     size: float  # of the part
 
     def turned(self, directions: Array) -> Array:
-        """(N, V, 3, 3) what stands left of the hand-eye, for directions (N, K, 3) of the axes."""
+        """Return rotations (N, V, 3, 3) of T_reference_mount for N guesses at the directions (N, K, 3) of K axes.
+
+        The flange's pose is A_left⁻¹ · A_right · T_base_flange, with the rotary axes' rotations as factors of A_left or
+        A_right (`Axes.stands_right`); a linear axis does not turn. With the part in hand it is inverted.
+        """
         out = np.broadcast_to(self.reported[:, :3, :3], (len(directions), *self.reported[:, :3, :3].shape))
         left = right = np.broadcast_to(np.eye(3), out.shape)
         for k, axis in enumerate(self.axes.axes):
@@ -91,19 +98,36 @@ class _Motions:
         return np.swapaxes(out, -1, -2) if self.to_hand else out
 
     def angles(self, directions: Array, R_mount: Array) -> Array:
-        """(N, P) rad between the motions of the scans and those foretold, R_mount (N, 3, 3)."""
+        """Return angles (N, P), rad, between P motions of the scanner as registered and as N guesses predict them.
+
+        Args:
+            directions: (N, K, 3) of the axes.
+            R_mount: (N, 3, 3) rotation of the hand-eye.
+        """
         pose = self.turned(directions) @ R_mount[:, None]
         first, second = pose[:, self.pairs[:, 0]], pose[:, self.pairs[:, 1]]
         trace = np.einsum("npji,npjk,pik->np", first, second, self.scanner[:, :3, :3])
         return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
     def places(self, directions: Array, R_mount: Array, use: Array) -> tuple[tuple[Axis, ...], Array] | None:
-        """Axes and hand-eye (4, 4) that turns (K, 3), (3, 3) and the motions in use (P,) lead to; None: too few."""
+        """Return axes and hand-eye (4, 4) for given rotations: what is unknown of positions is linear least squares.
+
+        The unknowns x are the translation of the hand-eye (3), and per axis a point (3, rotary) and a travel per unit
+        of the reading (3, linear). Weights make wrong motions count little, repeated 20 times.
+
+        Args:
+            directions: (K, 3) of the rotary axes.
+            R_mount: (3, 3) rotation of the hand-eye.
+            use: (P,) bool, motions that count.
+
+        Returns:
+            None where a linear axis has no direction.
+        """
         K = len(self.axes.axes)
         size = 3 + 6 * K
 
         def shifts(x: Array) -> Array:
-            """Return what is left (3P,) of the shifts between views that the scanner saw, for unknown positions x."""
+            """Return residuals (3P,) of the translations between views, first view's scanner frame, for unknowns x."""
             placed = self._shifted(directions, x)
             pose = placed @ frames.make(R_mount, x[:3])
             first, second = pose[self.pairs[use, 0]], pose[self.pairs[use, 1]]
@@ -122,6 +146,7 @@ class _Motions:
             if not axis.is_placed:
                 start = 3 + 6 * k if axis.is_rotary else 6 + 6 * k
                 free += [start, start + 1, start + 2]
+        # `shifts` is linear in x: differences are its columns.
         base = shifts(at)
         columns = np.column_stack([shifts(at + np.eye(size)[i]) - base for i in free])
         x = at.copy()
@@ -145,7 +170,13 @@ class _Motions:
         return tuple(axes), frames.make(R_mount, x[:3])
 
     def _shifted(self, directions: Array, x: Array) -> Array:
-        """(V, 4, 4) what stands left of the hand-eye; x holds its shift, and per axis a point and a way (3,) each."""
+        """Return T_reference_mount (V, 4, 4) for K axes at given places.
+
+        Args:
+            directions: (K, 3) of the rotary axes.
+            x: (3 + 6K,): translation of the hand-eye, which is not used here, then per axis a point (3) of a rotary and
+                the travel per unit of the reading (3) of a linear one.
+        """
         count = len(self.reported)
         left = right = np.broadcast_to(np.eye(4), (count, 4, 4))
         for k, axis in enumerate(self.axes.axes):
@@ -164,10 +195,12 @@ class _Motions:
         return frames.inverse(T) if self.to_hand else T
 
     def residual(self, axes: Axes, placement: Array, T_mount: Array) -> Array:
-        """Return how far the scans moved otherwise (P, 6) than axes and hand-eye foretell: twists, turns at the part.
+        """Return twists (P, 6), length_unit, between the scanner's motions as registered and as the axes predict them.
+
+        Rotations are multiplied by the size of the part.
 
         Args:
-            placement: (K, 6) twists by which the axes stand elsewhere.
+            placement: (K, 6) twists by which the axes are displaced from their present places.
             T_mount: (4, 4) hand-eye.
         """
         motion = AxisMotion(axes.readings, placement, np.zeros((len(axes.axes), 3)), axes.as_read().error)
@@ -178,7 +211,11 @@ class _Motions:
 
 
 def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
-    """Return the axes, placed; None where too few motions agree."""
+    """Return the axes with places found from motions of the scans; None where fewer than `_FEWEST` motions agree.
+
+    For each likely set of rotations: positions by linear least squares, then all together. The result under which most
+    motions agree is taken.
+    """
     axes = axes_of(session)
     reported = reported_poses(session)
     pairs = _pairs(axes, reported)
@@ -206,9 +243,12 @@ def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
 
 
 def _pairs(axes: Axes, reported: Array) -> list[tuple[int, int]]:
-    """Views that may overlap: neighbours in time, by the reading of each axis, and by how the arm is turned.
+    """Return pairs of views (v < w) that may overlap: neighbours in time, in an axis's reading, and in orientation.
 
-    The angle of a motion is that of the scanner, whatever the hand-eye; where a rotary axis is missing it says little.
+    Neighbours in orientation are the `_ALIKE` views whose flange is turned least from that of a view.
+
+    Args:
+        reported: (V, 4, 4) T_base_flange.
     """
     count = len(axes.readings)
     pairs = set(neighbouring_views(count))
@@ -224,7 +264,14 @@ def _pairs(axes: Axes, reported: Array) -> list[tuple[int, int]]:
 
 
 def _turns(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]]:
-    """Return directions (K, 3) and turns of the hand-eye (3, 3) that explain motions, the likeliest few."""
+    """Return up to four distinct pairs of axis directions (K, 3) and hand-eye rotation (3, 3), likeliest first.
+
+    Random guesses are scored by capped angles between motions as registered and as predicted; the best `_IMPROVED`
+    are refined and scored again, more strictly.
+
+    Args:
+        T_mount: (4, 4) hand-eye whose rotation is then fixed; None: it is searched too.
+    """
     rng = np.random.default_rng(0)
     known = [axis.direction for axis in motions.axes.axes]
     wanted = [k for k, axis in enumerate(motions.axes.axes) if axis.is_rotary and known[k] is None]
@@ -256,13 +303,16 @@ def _turn(R: Array) -> Array:
 
 
 def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:
-    """Return directions (K, 3) and R_mount after least squares of all angles between motions; wrong ones count little.
+    """Return directions (K, 3) and R_mount (3, 3) after robust least squares of the angles between motions.
 
     Args:
-        wanted: numbers of the axes whose directions are sought; the others stay.
+        directions: (K, 3) to begin with.
+        R_mount: (3, 3) to begin with.
+        wanted: numbers of the axes whose directions are sought; the others are fixed.
     """
 
     def moved(x: Array) -> tuple[Array, Array]:
+        """Return both after a step x: a rotation vector of the hand-eye, then one of each wanted axis."""
         turned = directions.copy()
         for i, k in enumerate(wanted):
             turned[k] = Rotation.from_rotvec(x[3 + 3 * i : 6 + 3 * i]).as_matrix() @ directions[k]
@@ -277,9 +327,10 @@ def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted:
 
 
 def _refined(motions: _Motions, axes: Axes, T_mount: Array) -> tuple[Axes, Array]:
-    """Return axes and hand-eye after robust least squares of all that is unknown.
+    """Return axes and hand-eye (4, 4) after robust least squares of the hand-eye's twist and the unstated axes' places.
 
-    A rotary axis errs by tilts and shifts across it, numbers 0, 1, 3 and 4 of its placement; a linear one by tilts.
+    The placement of an axis is a twist in its own frame. A rotary one is free to tilt and shift across its direction,
+    numbers 0, 1, 3 and 4; a linear one to tilt, 0 and 1.
     """
     free = [
         (k, i)
@@ -290,6 +341,7 @@ def _refined(motions: _Motions, axes: Axes, T_mount: Array) -> tuple[Axes, Array
     unit = np.array([1.0] * 3 + [motions.size] * 3 + [1.0 if i < 3 else motions.size for _, i in free])
 
     def moved(x: Array) -> tuple[Array, Array]:
+        """Return placements (K, 6) and hand-eye (4, 4) after a step x, length_unit; rotations are over the size."""
         x = x * unit
         placement = np.zeros((len(axes.axes), 6))
         for value, at in zip(x[6:], free, strict=True):

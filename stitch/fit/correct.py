@@ -98,18 +98,21 @@ def correct(
     pose_error_prior: PoseErrorPrior | None = None,
     met: Sequence[Overlaps] | None = None,
 ) -> Correction:
-    """Correct one hand-eye from all overlapping pairs of all captures of a rig.
+    """Return the hand-eye corrected from all overlapping pairs of all captures of a rig.
+
+    Three stages: ICP of the hand-eye alone; each view moved by its overlaps alone; generalised least squares of the
+    hand-eye over these poses, linearised twice. The covariance is computed when it is first asked for.
 
     Args:
         captures: one per session; all carry the same scanner on the same mount.
-        T_mount: (4, 4) coarse hand-eye, T_mount_scanner.
-        gate: first distance between partners, length_unit: the coarse error at the part.
-        scanner_errors: errors of the scanner that all views have in common; they widen the covariance.
-        pose_error_prior: how poses may err beside white scatter; None: they do not.
-        met: overlaps per capture under the coarse hand-eye, if they are at hand.
+        T_mount: (4, 4) coarse hand-eye, maps scanner to mount.
+        gate: largest distance between corresponding points at first, length_unit: the coarse error at the part.
+        scanner_errors: returns errors of the scanner that all views share; they widen the covariance. None: no errors.
+        pose_error_prior: returns the pose errors beside white scatter; None: there are none.
+        met: overlaps per capture under the coarse hand-eye; None: they are searched.
 
     Raises:
-        NoResultError: no two views of a capture overlap, or they hold the hand-eye nowhere.
+        NoResultError: no two views of a capture overlap, or the hand-eye runs away.
     """
     T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), first=met, recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
@@ -119,9 +122,9 @@ def correct(
     )
     T_first, scatters = step_hand_eye(captures, unconstrained, T_mount)
     require_near_scanner(captures, T_first)
-    # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
+    # With large pose errors the step is not linear, and what is not would count as noise: hence a second one.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
-    # Where clouds now weigh otherwise beside labelled points, the views are moved anew.
+    # The new noise factor changes how clouds weigh beside labelled points: where there are such, views are moved anew.
     unconstrained = tuple(
         f.relative_to(c.poses(T_first)) if c.sightings is None else unconstrained_poses(c, c.poses(T_first), gate)
         for c, f, gate in zip(captures, unconstrained, gates, strict=True)
@@ -173,15 +176,18 @@ def icp_hand_eye(
     maximum: int = _MAXIMUM_ITERATIONS,
     recorder: Recorder | None = None,
 ) -> tuple[Array, list[Overlaps], list[float]]:
-    """Iterate matching and the common step until it no longer moves the parts.
+    """Return T_mount (4, 4) by ICP: matching and one step of the hand-eye, repeated until it no longer moves the part.
+
+    It ends at a step below `_CONVERGED` sigmas while the gates no longer close, or silently after `maximum`.
 
     Args:
-        T_mount: (4, 4) start, T_mount_scanner.
-        gates: first distance between partners per capture, length_unit.
-        first: overlaps per capture under the start, if they are at hand.
+        T_mount: (4, 4) start, maps scanner to mount.
+        gates: per capture the largest distance between corresponding points at first, length_unit.
+        first: overlaps per capture under the start; None: they are searched.
+        samples: points of a view that are searched in others, at most; fewer while the gate is wide.
 
     Returns:
-        T_mount (4, 4), the last overlaps per capture and the rms per iteration.
+        T_mount, the last overlaps per capture, and the rms per iteration, length_unit.
     """
     recorder = recorder or SilentRecorder()
     coarse_queries = [common_samples(c.scans, min(samples, _WIDE_SAMPLES)) for c in captures]
@@ -208,7 +214,7 @@ def icp_hand_eye(
         if moved < _CONVERGED and settled:
             if not wide:
                 break
-            # Surfaces that agree no better than a few spacings keep the gate wide.
+            # The gate is still wide, as where surfaces agree badly: go on with all points before it ends.
             closing = False
         gates = tighter if moved < _AT_REST else next_gates(captures, overlaps)
     return T_mount, overlaps, history
@@ -217,7 +223,15 @@ def icp_hand_eye(
 def common_step(
     captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array, visible: Array
 ) -> tuple[Array, float]:
-    """Return ξ (6,) = −D⁻¹b over all captures, along visible twists (6, k), and how far it moves the part, rms."""
+    """Return the Gauss–Newton step ξ (6,) of the hand-eye, T_mount·exp(ξ), over all captures, and its rms at the part.
+
+    ξ = −D⁻¹b with D = Σ JᵀHJ/σ², b = Σ Jᵀh/σ², where J are the twists of the views per twist of the hand-eye, H and h
+    the normal equations of the views. The motion is the rms translation of the views at the part, in σ.
+
+    Args:
+        T_mount: (4, 4) maps scanner to mount.
+        visible: (6, k) twists of the hand-eye that the motions show; ξ is a combination of these.
+    """
     D = np.zeros((6, 6))
     b = np.zeros(6)
     jacobians = [
@@ -247,10 +261,10 @@ def with_noise_factor(capture: Capture, scatter: Repeatability) -> Capture:
 
 
 def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correction:
-    """Return overlaps and pose scatter of `captures` under a model, as `correct` returns them.
+    """Return the correction of a rig whose hand-eye is given and stays as it is: overlaps and scatter under it.
 
     Args:
-        captures: without the model's effects.
+        captures: with the model's effects taken out.
 
     Raises:
         NoResultError: no two views overlap under the hand-eye.
@@ -274,7 +288,11 @@ def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correctio
 
 
 def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
-    """Return correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
+    """Return the correspondences of a capture under a hand-eye that is right but for pose errors.
+
+    Args:
+        T_mount: (4, 4) maps scanner to mount.
+        gate: largest distance between corresponding points at first, length_unit; it narrows to what the data ask.
 
     Raises:
         NoResultError: no two views overlap.
@@ -284,10 +302,11 @@ def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlap
 
 
 def gate_of_model(capture: Capture, T_mount: Array) -> float:
-    """Return the distance that partners may have under a model that was fitted, length_unit; NaN without clouds.
+    """Return the largest distance between corresponding points under a fitted model, length_unit; NaN without clouds.
 
     Args:
-        capture: without the model's effects.
+        capture: with the model's effects taken out.
+        T_mount: (4, 4) maps scanner to mount.
 
     Raises:
         NoResultError: no two views overlap.
@@ -298,7 +317,13 @@ def gate_of_model(capture: Capture, T_mount: Array) -> float:
 
 
 def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
-    """Return the distance that partners may have, from one that is too large.
+    """Return the largest distance between corresponding points that spacing and residuals ask for, length_unit.
+
+    It narrows from `gate`, in at most `_TIGHTENINGS` rounds of matching under fixed poses.
+
+    Args:
+        T_mount: (4, 4) maps scanner to mount.
+        gate: to begin with, too large, length_unit.
 
     Raises:
         NoResultError: no two views overlap.

@@ -74,7 +74,10 @@ class FittedRig:
         return [session.targets.rows.capture for session in self.sessions if session.targets is not None]
 
     def model_of(self, index: int) -> Model:
-        """Return the model of session `index`: one for all of scans; of labelled points with a hand-eye of its own."""
+        """Return the model of session `index`.
+
+        From surfaces all sessions share one model; from labelled points each session has its own hand-eye.
+        """
         if self.correction is not None:
             return self.correction.model
         targets = self.sessions[index].targets
@@ -117,12 +120,12 @@ class Step(Generic[LinearisedT, SolutionT]):
 def iterate(
     linearise: Callable[[Step[LinearisedT, SolutionT] | None], LinearisedT], *, at_most: int, converged: float
 ) -> Iterator[Step[LinearisedT, SolutionT]]:
-    """Yield the steps of a fit from a model that is near, until one moves nothing.
+    """Yield the steps of a fit: linearise, choose the parameters to fit, solve; the choice is fixed after two steps.
+
+    The last step is the first that moves no unknown by `converged` sigmas, or silently step `at_most`.
 
     Args:
-        linearise: about where the step before led; None: about the first model.
-        at_most: steps.
-        converged: a step that moves no unknown by so many sigmas is the last.
+        linearise: returns the problem about the model after the step given; None: about the first model.
 
     Raises:
         NoResultError: no two views overlap.
@@ -140,16 +143,19 @@ def iterate(
 
 
 def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], WhitenedData]) -> Mask:
-    """Return (P,) parameters that the views support and can tell apart.
+    """Return a mask (P,) of the parameters that the views support and can tell apart; the others are to stay at zero.
+
+    Parameters that place axes (`Term.is_geometry`) are chosen first, by whether the views show them at all. Then the
+    groups of parameters of each effect are selected by their evidence (`select_supported`), with the axes free.
 
     Args:
-        before: (P,) what explained scatter so far; never what another run's arm brought.
-        whitened: the observation in units of the scatter that is left when some parameters explain theirs.
+        before: (P,) mask of the parameters fitted so far; none of another run's arm (`kept`) is among them.
+        whitened: returns the observations whitened by the scatter that remains when the parameters of a mask are free.
     """
     sizes = sizes_of(terms)
     geometry = np.array([term.is_geometry and not p.held for term in terms for p in term.parameters], bool)
     if geometry.any():
-        # Where an axis stands is asked as the hand-eye is, before anything that may go wrong.
+        # The place of an axis is unknown like the hand-eye; effects are judged with it free.
         data = whitened(before | geometry)
         shown = geometry & independent(data.base, data.further * geometry, sizes, 1 / UNSEEN)
         others = [term for term in terms if not term.is_geometry]
@@ -158,6 +164,7 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
         there = np.array([not term.is_geometry for term in terms for _ in term.parameters], bool)
 
         def beside(free: Mask) -> WhitenedData:
+            """Return the whitened data of the effects alone, with the axes shown among the base columns."""
             whole = shown.copy()
             whole[there] = free
             seen = whitened(whole)
@@ -189,19 +196,20 @@ def fit_without_outliers(
     fit: Callable[[Sequence[Measurement], FitResult | None], FitResult],
     targets_of: Callable[[Sequence[Measurement], FitResult], Sequence[TargetModelFit | None]],
 ) -> tuple[FitResult, list[FittedSession]]:
-    """Fit, take out the labelled points that contradict the rest, and again, until none does.
+    """Return the fit and the sessions without labelled points that contradict the rest: fitted again until none does.
+
+    Views with mislabelled targets are taken out before the first fit, since they would pull it.
 
     Args:
-        fit: from the measurements, and the result of the round before, to the result.
-        targets_of: the labelled points of every session under that.
+        fit: returns the fit of measurements; its second argument is the fit of the round before, None in the first.
+        targets_of: returns the labelled points of every session under a fit, None for a session without any.
 
     Raises:
         NoResultError: more than a third of the labelled points of a session would have to go.
     """
-    whole = [_with_sightings(m, s.with_outliers) if (s := m.capture.sightings) else m for m in measurements]
-    # Views whose targets bear each other's names would pull the fit to where these lie.
-    outliers = [[m.outlier for m in find_mislabelled(s)] if (s := w.capture.sightings) else [] for w in whole]
-    measurements = [_remove_points(m, taken) for m, taken in zip(whole, outliers, strict=True)]
+    every_point = [_with_sightings(m, s.with_outliers) if (s := m.capture.sightings) else m for m in measurements]
+    outliers = [[m.outlier for m in find_mislabelled(s)] if (s := e.capture.sightings) else [] for e in every_point]
+    measurements = [_remove_points(m, taken) for m, taken in zip(every_point, outliers, strict=True)]
     result: FitResult | None = None
     while True:
         result = fit(measurements, result)
@@ -215,7 +223,11 @@ def fit_without_outliers(
 
 
 def _remove_points(measurement: Measurement, outliers: Sequence[Outlier]) -> Measurement:
-    """Return the measurement without some of its labelled points."""
+    """Return the measurement without some of its labelled points.
+
+    Raises:
+        NoResultError: more than a third of all its labelled points would be left out by now.
+    """
     sightings = measurement.capture.sightings
     if not outliers or sightings is None:
         return measurement

@@ -69,13 +69,13 @@ def start_live_fit(correction: Correction) -> LiveFit:
 
 
 def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_flange: Array) -> tuple[LiveFit, float]:
-    """Move a new view to where the surfaces of the others put it, and add its correspondences.
+    """Return the fit with a new view as its last one, and the share of its points that lie on another view's surface.
 
-    Returns:
-        The fit with this view as its last, and the share of its sampled points that lie on the surface of another view.
+    First the new view alone is moved until it fits the others' surfaces, its gate narrowing; then all views are solved
+    together from all correspondences.
 
     Args:
-        T_reference_mount, T_reference_flange: (4, 4) of the view, as in `Capture`.
+        T_reference_mount, T_reference_flange: (4, 4) poses of the new view, as in `Capture`.
 
     Raises:
         NoResultError: it overlaps with no other view.
@@ -89,7 +89,6 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
     model_poses = capture.poses(fit.T_mount)
     poses = np.concatenate([fit.unconstrained.poses, model_poses[-1:]])
     gate, last = REUSE_GATE * part_size([capture]), len(poses) - 1
-    # The others stand still meanwhile: only their place counts, and the new view's samples.
     samples = [sample_points(s, SAMPLES) for s in capture.scans]
     matches = _match_last(capture, poses, gate, samples)
     for _ in range(_MAXIMUM_ITERATIONS):
@@ -113,7 +112,13 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
 
 
 def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:
-    """Fit the hand-eye to the views as they stand; partners are searched anew where the views have moved far."""
+    """Return the fit with its hand-eye and covariance fitted to the present poses of the views.
+
+    Correspondences are searched anew if views have moved by more than `_SEARCH_ANEW` gates since the last search.
+
+    Args:
+        prior: returns the pose errors and the scanner's errors that the covariance is to count.
+    """
     unconstrained = fit.unconstrained
     if fit.drifted > _SEARCH_ANEW * fit.gate:
         unconstrained = unconstrained_poses(fit.capture, fit.capture.poses(fit.T_mount), fit.gate)
@@ -145,7 +150,16 @@ def without_view(fit: LiveFit, view: int) -> LiveFit:
 
 
 def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> list[Match]:
-    """Return the correspondences of the last view with every other one that it overlaps."""
+    """Return the correspondences of the last view with every other one that it overlaps.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        gate: largest distance between corresponding points, length_unit.
+        samples: per view the numbers of the points that are searched.
+
+    Raises:
+        NoResultError: it overlaps with no other view.
+    """
     last = len(poses) - 1
     pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
     least = MINIMUM_OVERLAP * len(samples[last])
@@ -156,7 +170,11 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
 
 
 def _last_step(g: Gram) -> Array:
-    """Return the left twist (6,), about the centre, that brings the last view onto the others where they hold it."""
+    """Return the left twist (6,), about the centre of `g`, that brings the last view onto the others, which are fixed.
+
+    Zero in directions that the surfaces do not see. `g` holds pairs of the last view alone, as the second of each, so
+    that the solution of the normal equations has the sign of +b.
+    """
     unit = g.displacement_factors
     values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
     keep = values > NEAR_NULL * values[-1]
@@ -165,7 +183,14 @@ def _last_step(g: Gram) -> Array:
 
 
 def _solve_together(capture: Capture, poses: Array, matches: list[Match], gate: float) -> UnconstrainedPoses:
-    """Move all views by the correspondences that are known; they are not searched again."""
+    """Return the views moved by two Gauss–Newton steps of all known correspondences, which are not searched again.
+
+    The twists of the result are zeros: `relative_to` fills them in.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        gate: largest distance between corresponding points, length_unit, recorded with the overlaps.
+    """
     points = [scan.points for scan in capture.scans]
     for _ in range(2):
         ends = np.cumsum([len(m.residual) for m in matches])[:-1]

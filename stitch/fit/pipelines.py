@@ -54,15 +54,16 @@ class Pipeline(Protocol):
         method: str,
         until_screened: Callable[[], None],
     ) -> tuple[Fit, float]:
-        """Return one session with its single views registered, and fused, and its noise floor, length_unit.
+        """Return session `index` of a rig with its views registered and fused, and its noise floor, length_unit.
 
-        It runs beside the screening of the views; the recorder ends it where views are left out.
+        It runs in a background thread while the views are screened; where the screening leaves views out, the recorder
+        raises an exception that ends it.
 
         Args:
-            coarse: the stage before the fit.
-            seconds: that the fit has taken.
+            coarse: result of the stage before the fit.
+            seconds: time that the fit has taken.
             method: by which surfaces are registered: dpwvm, gicp or vmm.
-            until_screened: returns when it is known that all views stay.
+            until_screened: blocks until the screening has left all views in.
         """
         ...
 
@@ -77,10 +78,10 @@ def pipeline_for(session: SessionData) -> Pipeline:
 
 
 def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-    """Return what a session says about what a model lacks.
+    """Return the linear model of a session about a model: what diagnosis asks for missing effects.
 
     Args:
-        gate: largest distance between partners, length_unit; NaN without clouds.
+        gate: largest distance between corresponding points, length_unit; NaN without clouds.
 
     Raises:
         NoResultError: no two views overlap.
@@ -90,6 +91,12 @@ def linearise(session: SessionData, measurement: Measurement, model: Model, gate
 
 def coarse_stage(session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float) -> StageResult:
     """Return the coarse stage of a session: rms (length_unit) and number of correspondences under the first hand-eye.
+
+    With clouds these are distances between surfaces, else 3D distances of labelled points from their medians.
+
+    Args:
+        start: the hand-eye of the start, coarse or given.
+        seconds: time that the stage has taken.
 
     Raises:
         NoResultError: no two views overlap.

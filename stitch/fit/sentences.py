@@ -55,10 +55,14 @@ def surface_sentence(
     length_unit: str,
     effects: Sequence[str] = (),
 ) -> str:
-    """Return the residual between the surfaces, the noise floor, and the scatter of the poses.
+    """Return the verdict of a run in sentences: residual between surfaces, noise floor, scatter of the poses.
 
     Args:
-        effects: names of those that are in the model beside the hand-eye.
+        residual: rms between surfaces under the model, length_unit.
+        registered: the same after each view got its own correction.
+        floor: the same by the sensor's noise alone.
+        scatter: of the robot's poses.
+        effects: names of those in the model beside the hand-eye.
     """
     left, noise = (length_text(x, length_unit) for x in (residual, floor))
     model = f"One hand-eye with {' and '.join(effects)}" if effects else "One hand-eye"
@@ -71,10 +75,10 @@ def surface_sentence(
 
 
 def register_note(registration: Registration, session: SessionData, unseen: Array) -> str:
-    """Return which surfaces lie off as a whole, which moves mean nothing, and whether register ended early.
+    """Return the note of the register stage: surfaces that are offset, moves that mean nothing, an early end; or "".
 
     Args:
-        unseen: (V,) how far views were moved where no overlap shows it, length_unit.
+        unseen: (V,) how far register moved each view in directions that no overlap shows, length_unit.
     """
     lines = []
     for v, size in registration.offsets.items():
@@ -132,7 +136,8 @@ def correct_note(before: float, after: float) -> str:
 
 
 def coarse_note(start: CoarseHandEye) -> str:
-    """Return the source of the coarse hand-eye, and how much worse the runner-up is."""
+    """Return the note of the coarse stage: where the hand-eye comes from and, if searched, how clear the answer is."""
+    # A hand-eye that was given has no candidates.
     if not start.candidates:
         return start.source
     best = start.candidates[0]
@@ -144,7 +149,7 @@ def coarse_note(start: CoarseHandEye) -> str:
 
 
 def warnings(start: CoarseHandEye, hand_eye: HandEyeFit) -> tuple[str, ...]:
-    """Return what a user should know before trusting the hand-eye."""
+    """Return warnings about a hand-eye: a second answer as good, few degrees of freedom, a much widened covariance."""
     notes = []
     if start.is_ambiguous:
         notes.append(
@@ -165,7 +170,7 @@ def warnings(start: CoarseHandEye, hand_eye: HandEyeFit) -> tuple[str, ...]:
 
 
 def _largest_sources(hand_eye: HandEyeFit) -> str:
-    """Return the largest source of the variance of rotation and position."""
+    """Return a sentence that names the largest source of the variance of rotation and of position, with its share."""
     (turn, of_turn), (shift, of_shift) = (
         max(shares.items(), key=lambda item: item[1]) for shares in (hand_eye.rotation_shares, hand_eye.position_shares)
     )
@@ -181,7 +186,13 @@ def _largest_sources(hand_eye: HandEyeFit) -> str:
 def view_notes(
     left_out: Sequence[ExcludedView], kept: Sequence[ExcludedView], suspected: Sequence[ExcludedView] = ()
 ) -> tuple[str, ...]:
-    """Return a note for views that were left out, kept as asked, or stand out."""
+    """Return notes on views that do not fit their robot pose, for the report of a run.
+
+    Args:
+        left_out: not used in the fit.
+        kept: would be left out, but the user asked to keep them.
+        suspected: stand out, but errors of the arm could explain them, so that they are used.
+    """
     notes = [f"View {item.view} does not fit its robot pose and was left out: {item.why}." for item in left_out]
     if left_out:
         notes.append(f"To fuse {'it' if len(left_out) == 1 else 'them'} all the same: stitch run --keep.")

@@ -62,11 +62,15 @@ Choice = tuple[Mask, Array, dict[str, list[Array]]]
 def fit_surfaces(
     measurements: Sequence[Measurement], model: Model, gates: Sequence[float], recorder: Recorder
 ) -> Correction:
-    """Fit hand-eye and effects that all sessions of a rig share.
+    """Return the fit of hand-eye and effects that all sessions of a rig share, with covariance and overlaps.
+
+    The steps of `iterate` find the values. The last one is then solved again with the prior of pose errors: the values
+    hardly change, their covariance does.
 
     Args:
         model: effects in use with the values to begin with.
-        gates: per session the first distance between partners, length_unit.
+        gates: per session the largest distance between corresponding points at first, length_unit.
+        recorder: is shown every step of the first session.
 
     Raises:
         NoResultError: no two views overlap.
@@ -121,10 +125,15 @@ class LinearisedSurfaces:
     columns: list[Array]  # per session (6V, P)
 
     def choose(self, before: Choice | None) -> Choice:
-        """Return the parameters that the views ask for, those of before first, and what errs beside them."""
-        # What the scanner repeats hardly changes with the last micrometres.
+        """Return the parameters to fit, the rms of those left at zero, and the scanner's errors: see `Choice`.
+
+        An effect in use that is the scanner's scale replaces the error of that scale, else it would count twice.
+
+        Args:
+            before: the choice of the step before; None in the first.
+        """
         scanner_errors = rig_scanner_errors(self.measurements, self.unconstrained)
-        # The effect of one scanner among several takes the place of that one's column.
+        # Effects may be of one scanner among several, NAME@SCANNER: then only that one's column goes.
         of_scale = [term.effect for term in self.model.terms if term.name.partition("@")[0] == _SCALE]
         if any(not effect.scanner for effect in of_scale):
             del scanner_errors[SCANNER_SCALE]
@@ -141,7 +150,12 @@ class LinearisedSurfaces:
         return fitted, np.where(held | self._is_gauge, 0.0, omitted), scanner_errors
 
     def solve(self, choice: Choice, errors: PoseErrors | None = None) -> "SurfaceStep":
-        """Return the step, with a covariance that counts how poses may err; without, one of scatter alone."""
+        """Return the step of hand-eye and chosen parameters by generalised least squares; those not chosen become zero.
+
+        Args:
+            choice: as `choose` returned it.
+            errors: pose errors beside white scatter that the covariance counts; None: there are none.
+        """
         fitted = choice[0]
         terms = self.model.terms
         before = values_of(terms)
@@ -152,7 +166,7 @@ class LinearisedSurfaces:
             self.captures, self.unconstrained, self.model.T_mount, effects, self._common_errors(choice), errors
         )
         values = before.copy()
-        # What the views cannot see stays at zero; the time of an event stays where it was.
+        # Held parameters, as the time of an event, are not fitted and keep their values.
         values[~self._held] = 0.0
         values[fitted] = hand_eye.values
         model = replace(
@@ -165,8 +179,11 @@ class LinearisedSurfaces:
         return Step(self, choice, hand_eye, model, moved, _model_rms(self.unconstrained))
 
     def _common_errors(self, choice: Choice) -> dict[str, list[Array]]:
-        """Return twists that all views have in common: a parameter at zero that is not zero errs alike in every view,
-        as the scanner does; so does another run's arm."""
+        """Return by source, per session, left twists (6V, K) of the views for one sigma of errors that all views share.
+
+        Sources are the scanner, each effect whose parameters are left at zero though they may not be, and the
+        uncertainty of another run's arm.
+        """
         _, omitted, scanner_errors = choice
         terms = self.model.terms
         errors = dict(scanner_errors)
@@ -185,9 +202,10 @@ class LinearisedSurfaces:
 
     @property
     def _is_gauge(self) -> Mask:
-        """(P,) parameters that place axes, where no robot says how their common frame stands.
+        """(P,) mask of parameters that place axes in a session without a robot.
 
-        Of these some are not fitted, since they move all together: that choice is free, and hides nothing.
+        Nothing then says where the common frame of the axes stands. Some of these parameters move all axes together:
+        leaving them at zero is a choice of that frame (a gauge), not an error.
         """
         is_free = any(m.views.axes and not m.views.axes.has_robot for m in self.measurements)
         return np.array(
@@ -212,10 +230,10 @@ SurfaceStep = Step[LinearisedSurfaces, HandEyeFit]
 
 
 def linearise_surfaces(measurements: Sequence[Measurement], model: Model, gates: Sequence[float]) -> LinearisedSurfaces:
-    """Return the views of all sessions moved by their overlaps alone, and what the effects of a model do to them.
+    """Return the fit's problem about a model: views moved by their overlaps alone, and twists per effect's parameter.
 
     Args:
-        gates: per session the first distance between partners, length_unit.
+        gates: per session the largest distance between corresponding points at first, length_unit.
     """
     captures, unconstrained = _free_views(measurements, model, gates)
     columns = [view_columns(m, model, f) for m, f in zip(measurements, unconstrained, strict=True)]
@@ -225,10 +243,10 @@ def linearise_surfaces(measurements: Sequence[Measurement], model: Model, gates:
 def _free_views(
     measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
 ) -> tuple[tuple[Capture, ...], list[UnconstrainedPoses]]:
-    """Return the captures without the effects of a model, and their views freed from where it puts them.
+    """Return per session the capture with the effects of a model taken out, and its views moved by the overlaps alone.
 
     Args:
-        gates: largest distance between partners, of each capture, length_unit.
+        gates: per session the largest distance between corresponding points at first, length_unit.
     """
     captures = tuple(corrected_capture(measurement, model) for measurement in measurements)
     unconstrained = [
@@ -240,7 +258,7 @@ def _free_views(
 def _model_rms(unconstrained: Sequence[UnconstrainedPoses]) -> float:
     """Return the weighted rms distance (length_unit) that a model leaves between the surfaces of all sessions.
 
-    By the correspondences of the free-network poses, with the views moved back to where the model has them.
+    The correspondences are those of views moved by the overlaps alone; the views are moved back to the model's poses.
     """
     squares = 0.0
     weights = 0.0
@@ -252,11 +270,11 @@ def _model_rms(unconstrained: Sequence[UnconstrainedPoses]) -> float:
 
 
 def _final_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
-    """Return the overlaps at the poses of the model, matched once more within the gate that these leave.
+    """Return the overlaps at the poses of the model, matched twice: the second time within the gate of the first.
 
     Args:
-        T_mount: (4, 4) hand-eye.
-        gate: largest distance between partners at first, length_unit.
+        T_mount: (4, 4) maps scanner to mount.
+        gate: largest distance between corresponding points the first time, length_unit.
     """
     samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     poses = capture.poses(T_mount)

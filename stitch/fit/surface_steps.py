@@ -40,7 +40,10 @@ _RMS_SAMPLES = 2_000_000
 def start(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
 ) -> list[CoarseHandEye]:
-    """Return the hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
+    """Return the hand-eye to begin with, one per session and all the same: of a model, stated, or searched.
+
+    Args:
+        file: model of another run, whose hand-eye goes before one stated in session.toml; None: there is none.
 
     Raises:
         NoResultError: no hand-eye makes the views overlap.
@@ -59,7 +62,15 @@ def start(
 def fit(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
 ) -> FittedRig:
-    """Fit the hand-eye to the scans; with effects, both. Labelled points that contradict the rest are taken out."""
+    """Return the fit of hand-eye, and effects if there are any, to the scans of all sessions of a rig.
+
+    It is repeated without labelled points that contradict the rest. At the end the measurements get the noise factor
+    that the fit found.
+
+    Args:
+        start: what the fit begins from, see `once`.
+        recorder: is shown every step of the first session.
+    """
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
         """Fit all sessions once: by a given model, from a model, or by correction and then effects."""
@@ -73,7 +84,7 @@ def fit(
             return correction
         gates = [overlaps.gate for overlaps in correction.overlaps]
         weighed = _weighed(measurements, correction)
-        # An event or a time constant is one for the whole rig: the first session says where it begins.
+        # The time of an event is common to the rig: the first session decides where its search begins.
         model = start.effects(weighed[0], Model(correction.geometry.T_mount), gates[0])
         return fit_surfaces(weighed, model, gates, recorder)
 
@@ -110,7 +121,7 @@ def _weighed(measurements: Sequence[Measurement], correction: Correction) -> lis
 
 def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
     """Return per session where its targets lie under the corrected model; None where it has none."""
-    # How certain the hand-eye is need not be found here where there are none.
+    # `correction.hand_eye` computes a covariance: only where targets need it.
     return [
         None if m.capture.sightings is None else locate_targets(m, correction.model, correction.hand_eye.inflation)
         for m in measurements
@@ -118,7 +129,10 @@ def _locate_targets(measurements: Sequence[Measurement], correction: Correction)
 
 
 def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-    """Return the views' free-network poses under the model, from their overlaps and common targets.
+    """Return the linear model of a session's surfaces about `model`: its views are moved by the overlaps alone.
+
+    Args:
+        gate: largest distance between corresponding points at first, length_unit.
 
     Raises:
         NoResultError: no two views overlap.
@@ -138,7 +152,13 @@ def finish(
     method: str,
     until_screened: Callable[[], None],
 ) -> tuple[Fit, float]:
-    """Register session `index` of a rig under the common model by a method, and fuse it; return its noise floor too.
+    """Return session `index` of a rig with its views registered and fused, and its noise floor, length_unit.
+
+    Args:
+        coarse: result of the stage before the fit.
+        seconds: time that the fit has taken.
+        method: by which surfaces are registered: dpwvm, gicp or vmm.
+        until_screened: blocks until the screening has left all views in.
 
     Raises:
         InputError: a scan changed on disk since it was read.
@@ -152,7 +172,7 @@ def finish(
     recorder.stage(corrected, poses_model)
     registration, registered = _register_views(session, correction, index, recorder, method)
     if has_whole_clouds(session):
-        # To read every point again takes time and room: only for views that stay.
+        # Every point is then read from the files again, which takes time and memory: only for views that stay.
         until_screened()
     clock = Clock()
     fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
@@ -172,7 +192,7 @@ def finish(
         repeatability=scatter,
         verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
-        # A search that nobody goes on from takes room.
+        # The state of the search is not needed any more, and large.
         overlaps=replace(overlaps, searched=None),
         registered=replace(registration.overlaps, searched=None),
     )
@@ -182,7 +202,12 @@ def finish(
 def _register_views(
     session: SessionData, correction: Correction, index: int, recorder: Recorder, method: str
 ) -> tuple[Registration, StageResult]:
-    """Return where register puts the single views of one session, and its stage, which the recorder is shown."""
+    """Return the registration of one session's views, each with a correction of its own, and its stage for the report.
+
+    Args:
+        index: number of the session in the rig.
+        method: dpwvm, gicp or vmm.
+    """
     clock = Clock()
     capture, overlaps = correction.captures[index], correction.overlaps[index]
     poses_model = capture.poses(correction.geometry.T_mount)
@@ -208,7 +233,10 @@ def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: floa
 
 
 def _fused_rms(residual: Array) -> float:
-    """Return the rms (length_unit) of a fused cloud's residuals (N,) without edges; NaN where no point has one."""
+    """Return the rms (length_unit) of a fused cloud's residuals (N,), length_unit, without edges; NaN if all are NaN.
+
+    Of a large cloud every k-th residual is read, `_RMS_SAMPLES` at most.
+    """
     sample = take_mapped(residual, np.arange(0, len(residual), -(-len(residual) // _RMS_SAMPLES)))
     distances = sample[np.isfinite(sample)]
     if not len(distances):
@@ -218,7 +246,10 @@ def _fused_rms(residual: Array) -> float:
 
 
 def per_view_rms(overlaps: Overlaps, views: int) -> Array:
-    """Return (V,) rms of the residuals that touch a view, inside the robust gate; NaN for a view without partners."""
+    """Return per view (V,) the rms residual, length_unit, over all pairs that it is in; NaN for a view in none.
+
+    Residuals beyond the robust gate do not count.
+    """
     square = np.zeros(views)
     count = np.zeros(views)
     for (v, w), s, n in zip(overlaps.gram.pairs, overlaps.gram.raw_square, overlaps.gram.count, strict=True):
@@ -228,7 +259,7 @@ def per_view_rms(overlaps: Overlaps, views: int) -> Array:
 
 
 def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
-    """Return what a user should know before trusting the result."""
+    """Return warnings and notes on session `index` for the report, about hand-eye and labelled points."""
     assert fitted.correction is not None
     targets, outliers = fitted.sessions[index].targets, fitted.sessions[index].outliers
     of_targets = () if targets is None else mixed_notes(targets, outliers, session)

@@ -47,11 +47,14 @@ _MIN_VIEWS_FOR_REML = 3  # numbers for each that is free
 
 
 def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list[TargetModelFit]:
-    """Fit hand-eyes, landmarks and common effects together, from a start that is near; one result a session.
+    """Return per session its hand-eye, landmarks and the common effects, fitted together, with covariances.
+
+    The covariance of the last step is multiplied by the inflation that views left out in groups ask for. To it are
+    added the sigmas of another run's arm, if the model has one.
 
     Args:
-        sessions: of one arm; their poses scatter alike.
-        recorder: shows the first of them.
+        sessions: of one arm, about models that are near; their poses scatter alike.
+        recorder: is shown every step of the first session.
     """
 
     def linearise(before: "TargetStep | None") -> LinearisedTargets:
@@ -67,6 +70,7 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
         history.append(step.rms)
     linearised, terms = step.linearised, step.model.terms
     moved, blocks, covariance, variances = step.solution
+    # Blocks of all sessions come one after the other: numbers of views become numbers of blocks.
     groups = [
         at.start + views
         for session, at in zip(linearised.sessions, linearised.blocks_of, strict=True)
@@ -74,7 +78,7 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
     ]
     inflation = blocks.inflation(groups, covariance)
     covariance = covariance * inflation
-    # Another run's arm is known to its own sigmas, and errs alike in every view.
+    # `kept` is a root of the covariance of another run's arm, which errs alike in every view.
     kept = kept_root(terms, sessions[0].model.effects_covariance)
     shift = blocks.shift_by_errors(linearised.columns @ kept)
     covariance = covariance + shift @ shift.T
@@ -179,11 +183,15 @@ class LinearisedTargets:
         return fitted_parameters(terms, before, self._whitened)
 
     def solve(self, choice: Mask) -> "TargetStep":
-        """Return the step, with the variances of scatter and noise estimated anew."""
+        """Return the Gauss–Newton step of all unknowns, with the variances of scatter and noise estimated anew.
+
+        Args:
+            choice: (P,) mask of the parameters that are fitted; others become zero, but for those that are held.
+        """
         terms = self.sessions[0].model.terms
         before, sizes = values_of(terms), sizes_of(terms)
         held = np.array([p.held for p in stack_parameters(terms)], bool)
-        # What the views cannot see goes to zero, and the rest must make up for it; the time of an event stays.
+        # A parameter that goes to zero changes the residuals by its column: z is corrected for that.
         stays = held | choice
         mixed = self._mixed(np.concatenate([self.base, self.columns[..., choice]], axis=2))
         mixed = replace(mixed, z=mixed.z + self.columns[..., ~stays] @ before[~stays])
@@ -205,7 +213,7 @@ class LinearisedTargets:
         )
 
     def _mixed(self, A: Array) -> MixedModel:
-        """The rows of all sessions, with the columns A (B, m, a) as free mean."""
+        """Return the mixed model of the rows of all sessions, with columns A (B, m, a) of the free mean."""
         mixed = [
             session.rows.mixed_model(A[at, : session.rows.residual.shape[1]])
             for session, at in zip(self.sessions, self.blocks_of, strict=True)
@@ -214,16 +222,22 @@ class LinearisedTargets:
 
     @cached_property
     def _starting_variances(self) -> Array:
-        """(3,) variances from which a search begins: of the step before, or those that remain beside all effects."""
+        """(3,) variances at which a fit of them begins: those of the step before, else fitted with all effects free.
+
+        With few numbers, free effects would leave no scatter: then hand-eye and landmarks alone are free.
+        """
         if self.start is not None:
             return self.start
         everything = np.concatenate([self.base, self.columns], axis=2)
-        # Of few numbers all effects leave no scatter to be seen.
         enough = self._mixed(self.base).size > _MIN_VIEWS_FOR_REML * everything.shape[2]
         return fit_variances(self._mixed(everything if enough else self.base), both_starts=True).variances
 
     def _whitened(self, free: Mask) -> WhitenedData:
-        """Return base, further columns and observations in units of their scatter beside the `free` parameters (P,)."""
+        """Return columns of hand-eyes and landmarks, columns of effects, and observations, whitened.
+
+        The covariance is that with the `free` parameters (P,) of the effects fitted. The observations are those of a
+        model without effects: what the present values explain is added again.
+        """
         mixed = self._mixed(self.base)
         beside = self._mixed(np.concatenate([self.base, self.columns[..., free]], axis=2))
         half = whitener(mixed, fit_variances(beside, start=self._starting_variances).variances)
@@ -243,7 +257,7 @@ class LinearisedTargets:
         far = []
         for session in self.sessions:
             distance = float(np.median(np.linalg.norm(np.concatenate(session.rows.capture.point_sets), axis=1)))
-            # One radian and one working distance: keeps the unseen finite, moves nothing else.
+            # A weak prior of 1 rad and one working distance keeps unseen unknowns finite and moves no others.
             far += [1.0] * 3 + [distance] * (session.unknowns - 3)
         precision = np.concatenate([far, WEAK * sizes]) ** -2.0
         pull = np.concatenate([np.zeros(len(far)), -values * precision[len(far) :]])
@@ -254,9 +268,13 @@ TargetStep = Step[LinearisedTargets, Solution]
 
 
 def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit | None:
-    """Return targets in the middle of where the views put them under a model that clouds fitted; None without any.
+    """Return the labelled points of a session under a model that was fitted to clouds; None where it has none.
 
-    Their covariance counts the scatter of the poses, the sensor's noise and the hand-eye.
+    Their places are fitted by least squares, nothing else is. The covariance counts the scatter of the poses, the
+    sensor's noise and the hand-eye; no held-out distances are computed (NaN).
+
+    Args:
+        inflation: of the hand-eye's covariance, only passed on.
     """
     if measurement.capture.sightings is None:
         return None
@@ -277,8 +295,11 @@ def locate_targets(measurement: Measurement, model: Model, inflation: float) -> 
 
 
 def evaluate_targets(measurement: Measurement, model: Model) -> TargetModelFit:
-    """Return rows and scatter under a model of another run; a target that it does not know sits where the views have
-    it."""
+    """Return the labelled points of a session under the model of another run, which stays as it is.
+
+    Targets that the model knows have its places and sigmas; others are fitted by least squares. Since the views have
+    not fitted the model, all distances are held-out ones.
+    """
     capture = corrected_capture(measurement, model)
     landmarks, blocks, _ = fit_landmarks(capture, model.T_mount)
     assert capture.sightings is not None
@@ -315,9 +336,12 @@ def _rms_of_sessions(sessions: Sequence[TargetSession]) -> float:
 
 
 def _heldout_distances(rows: TargetRows, blocks: BlockLeastSquares, at: slice) -> Array:
-    """(V, S) distances of targets whose views were left out with their neighbours in time or pose.
+    """Return rms distances (V, S) of the targets, length_unit, in fits from which their views were left out.
+
+    Views are left out in groups of neighbours in time or pose (`grouped_folds`); NaN where a target was not seen.
 
     Args:
+        blocks: normal equations of the last step, of all sessions.
         at: the session's blocks among those of all.
     """
     square, count = np.zeros((2, *rows.distances(rows.residual).shape))
@@ -338,7 +362,7 @@ def _consecutive(lengths: Sequence[int]) -> list[slice]:
 
 
 def _block_columns(columns: Sequence[Array]) -> Array:
-    """(ΣB, m, Σa) columns (B, m, a) of unknowns that every session has for itself."""
+    """Return the block-diagonal columns (ΣB, m, Σa) of all sessions from each session's own columns (B, m, a)."""
     if len(columns) == 1:
         return columns[0]
     wide = []
@@ -350,7 +374,7 @@ def _block_columns(columns: Sequence[Array]) -> Array:
 
 
 def _stack_blocks(blocks: Sequence[Array]) -> Array:
-    """(ΣB, m, …) blocks (B, m, …) of several sessions; numbers that the smaller blocks lack are zero."""
+    """Return the blocks (B, m, …) of several sessions as one (ΣB, m, …), smaller blocks filled up with zeros."""
     if len(blocks) == 1:
         return blocks[0]
     m = max(b.shape[1] for b in blocks)

@@ -41,7 +41,12 @@ def start(
 
 
 def _start_session(session: SessionData, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
-    """Return the hand-eye to begin with: of another run, as stated in session.toml, or in closed form.
+    """Return the hand-eye to begin with: of another run, stated in session.toml, or in closed form.
+
+    Its gate is NaN, since labelled points need none.
+
+    Args:
+        file: model of another run; None: there is none.
 
     Raises:
         NoResultError: no target is seen in two views, and no other run says where they are.
@@ -65,9 +70,10 @@ def _sightings(measurement: Measurement) -> Sightings:
 def fit(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
 ) -> FittedRig:
-    """Fit hand-eyes and targets; then, with effects that all sessions share, all of them.
+    """Return the fit of each session's hand-eye and targets, and of effects that all sessions share, if there are any.
 
-    Under a model of another run nothing is fitted but targets that it does not know.
+    Three cases, by `start`. A model of another run: only targets that it does not know are fitted. A model fitted
+    before: the fit goes on from it. Else hand-eyes and targets first, then all with the effects.
     """
     if start.given is not None:
         file = start.given
@@ -83,7 +89,7 @@ def fit(
         return first
     measurements = [session.measurement for session in first.sessions]
     hand_eyes = [first.model_of(k).T_mount for k in range(len(sessions))]
-    # An event or a time constant is one for all sessions: the first says where it begins.
+    # The time of an event is common to all sessions: the first decides where its search begins.
     model = start.effects(measurements[0], Model(hand_eyes[0]), start.hand_eyes[0].gate)
     return _fit_models(sessions, measurements, [replace(model, T_mount=T) for T in hand_eyes], recorder)
 
@@ -91,7 +97,7 @@ def fit(
 def _fit_models(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
 ) -> FittedRig:
-    """Return the fit of models to labelled points, again without the outliers that it finds."""
+    """Return the fit to labelled points from one model per session, repeated without outliers until there are none."""
     drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
 
     def once(measurements: Sequence[Measurement], before: list[TargetModelFit] | None) -> list[TargetModelFit]:
@@ -126,9 +132,13 @@ def finish(
     method: str,
     until_screened: Callable[[], None],
 ) -> tuple[Fit, float]:
-    """Register single views by their labelled points, whatever the method; return the noise floor too.
+    """Return session `index` with each view moved by its most likely pose error, and its noise floor, length_unit.
 
-    There is no cloud to fuse.
+    There is no cloud: the targets stand in for one, `method` and `until_screened` are not used.
+
+    Args:
+        coarse: result of the stage before the fit.
+        seconds: time that the fit has taken.
     """
     clock = Clock()
     targets = fitted.sessions[index].targets
@@ -166,7 +176,7 @@ def _targets_as_cloud(targets: TargetModelFit) -> FusedCloud:
 
 
 def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
-    """Return what a user should know before trusting the result."""
+    """Return notes on session `index` for the report, about its labelled points."""
     targets = fitted.sessions[index].targets
     assert targets is not None
     return target_notes(targets, fitted.sessions[index].outliers, session)

@@ -69,6 +69,9 @@ def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> lis
 
     As published for allowances: μ± is the weighted mean of a class and σ± its robust sigma. Perfect agreement counts
     less than half then, since the mean of a half-normal lies at 0.8 σ.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
     """
     weights = []
     for m in matches:
@@ -81,9 +84,13 @@ def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> lis
 
 
 def class_variances(g: Gram, matches: Sequence[Match], weights: Sequence[Array]) -> Gram:
-    """Return the sums of Var₊ + Var₋ of every pair in place of its squares: rows and distances less their class's mean.
+    """Return the sums over pairs with Var₊ + Var₋ of the distances in place of their squares.
 
-    Both classes count alike, and together as much as the pair's weight.
+    Var₊ and Var₋ are the weighted variances of the distances d ≥ 0 and d < 0: rows and distances count less their
+    class's mean. Both classes have equal weight, together that of the pair.
+
+    Args:
+        weights: (M,) per match.
     """
     matrix, vector, square = np.zeros_like(g.matrix), np.zeros_like(g.vector), np.zeros_like(g.square)
     for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
@@ -111,10 +118,10 @@ def incidence(m: Match, capture: Capture, poses: Array) -> Array:
 
 
 def density(m: Match, capture: Capture) -> Array:
-    """Return (M,) √ of the geometric mean of both surfaces per point over its median, between ½ and 2.
+    """Return the weight (M,) by density: the root of the surface per correspondence over its median, between ½ and 2.
 
-    Crowded points share their errors, so that a place counts less than in proportion to its points (choice: the root,
-    halfway between a weight per point and a weight per surface).
+    The surface is the geometric mean of those of both points. Crowded points share their errors; the root is a choice,
+    halfway between an equal weight per point and one per surface.
     """
     area = np.sqrt(capture.scans[m.v].area[m.index_v] * capture.scans[m.w].area[m.index_w])
     return np.clip(np.sqrt(area / np.median(area)), 1 / _SPARSE, _SPARSE)
@@ -128,11 +135,16 @@ def weighted_median(d: Array, weight: Array) -> float:
 
 
 def class_scale(e: Array, scale: float) -> float:
-    """Return the robust sigma of the cleaner class of distances (M,) about their middle, drawn to `scale` of all pairs.
+    """Return the smaller of the robust sigmas of the positive and the negative distances, pooled with `scale`.
 
-    Flying points, flash and the far side of a thin edge all stand on one side; the other side shows the scatter.
+    Flying points, flash and the far side of a thin edge all stand on one side; the other side shows the scatter. A
+    class of fewer than `_CLASS` is left out.
+
+    Args:
+        e: (M,) distances of a pair, less their median, length_unit.
+        scale: robust sigma over all pairs; it counts like `_POOLED` further correspondences.
     """
-    # In one order the middles of both classes are at hand.
+    # Sorted, each class is one stretch, and its median the middle of it.
     e = np.sort(e)
     above, below = len(e) - np.searchsorted(e, 0.0, side="right"), np.searchsorted(e, 0.0)
     middles = [
@@ -154,10 +166,13 @@ class OffsetSums:
     """
 
     def __init__(self, g: Gram, matches: Sequence[Match], weights: Sequence[Array], capture: Capture) -> None:
-        """Sum the correspondences of all pairs of V views, each view with an offset along the normal beside its twist.
+        """Sum over the correspondences of all pairs what offsets a_v need in the normal equations beside twists δ_v.
+
+        A distance is e + B(δ_v − δ_w) − (a_v − a_w); a and δ of V views are unknown.
 
         Args:
-            weights: (M,) of each match.
+            g: sums over the pairs for the twists alone.
+            weights: (M,) per match.
         """
         views = g.views
         self.coupling = np.zeros((views, 6, views))  # Σ ±w Bᵀ, twists against offsets, less their sign
@@ -188,17 +203,16 @@ def acts(capture: Capture, view: int, index: Indices) -> Array:
 def with_offsets(
     H: Array, b: Array, sums: OffsetSums, variance: float, scale: float
 ) -> tuple[Array, Array, dict[int, float]]:
-    """Return normal equations (6V, 6V) and (6V,) in which the offsets that views show cost nothing, and these offsets.
+    """Return normal equations H, b of the twists with significant offsets of views eliminated, and these by view.
 
-    Those of views of which it is known cost nothing either, and are not among them.
-
-    An offset that is eliminated (Schur complement) leaves the weighted variance of that view's distances, λ = 0; the
-    rest keep λ = 1. They are the same equations if no view shows one.
+    An eliminated offset (Schur complement) costs nothing: of that view's distances only the weighted variance counts.
+    Offsets of views known to have stock are eliminated too, but not returned. Without any, H and b are unchanged.
 
     Args:
-        H, b: of the twists, with the prior of the robot, in units of variance.
-        variance: of a correspondence's distance, by which `sums` are divided.
-        scale: robust sigma of the distances.
+        H, b: (6V, 6V) and (6V,) of the twists with the prior of the robot, over the variance.
+        sums: of the same correspondences.
+        variance: of a correspondence's distance, length_unit², by which the sums are divided.
+        scale: robust sigma of the distances, length_unit.
     """
     C, D, e = sums.coupling.reshape(len(H), -1) / variance, sums.matrix / variance, sums.vector / variance
     information = D - C.T @ np.linalg.solve(H, C)
@@ -217,16 +231,16 @@ def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array)
 
 
 def shared_offsets(information: Array, vector: Array, least: float, known: Sequence[int] = ()) -> list[int]:
-    """Return the views whose surface stands off as a whole, the surest first; never all of them.
+    """Return the views whose whole surface is offset, the most significant first; never all of them.
 
-    One after the other the view with the largest χ² = c²/A of its offset, those before it set free, until χ² < 25 or
-    the offset −c/A is smaller than `least`. One offset of all views is none: A is blind to it.
+    In turn the view with the largest χ² = c²/A of its offset is freed, and the others are tested with it free. It ends
+    where no χ² is above `_SURE` with an offset |c/A| of at least `least`. An offset common to all views shows nowhere.
 
     Args:
         information: A (V, V) of the offsets, the twists eliminated.
         vector: c (V,) gradient at no offset.
-        least: size below which an offset is left to the poses.
-        known: views that are known to have stood off: they are free whatever is left of it.
+        least: smallest offset that counts, length_unit.
+        known: views known to have stock: they are freed whatever their χ².
     """
     free: list[int] = []
     A, c = information.copy(), vector.copy()
@@ -258,11 +272,14 @@ def plane_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> l
 
 
 def agreement(m: Match, capture: Capture, poses: Array) -> Array:
-    """Return the (M,) weight of two planes whose normals part by θ: 1/(cos² + sin²/ε) of θ/2.
+    """Return the weight (M,) of correspondences whose normals differ by θ: 1/(cos²(θ/2) + sin²(θ/2)/ε), 1 at θ = 0.
 
-    The inverse of nᵀ(C_v + C_w)n, with n the mean normal and C variances ε along a point's normal and 1 across it, over
-    its value at θ = 0. What is not the same plane, as the two sides of a thin edge or points that fly behind a
-    silhouette, counts little even where the distance happens to be small.
+    It is the inverse of nᵀ(C_v + C_w)n, with n the mean normal and C a point's covariance: ε along its normal, 1 across
+    (Segal, Haehnel & Thrun 2009). Points of different planes, as the two sides of a thin edge, count little even where
+    their distance is small.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
     """
     T_w_v = frames.inverse(poses[m.w]) @ poses[m.v]
     normals = frames.rotate(T_w_v, capture.scans[m.v].normals.take(m.index_v, axis=0))

@@ -69,10 +69,14 @@ class RegisteredSession:
 
 
 def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
-    """Fuse all supported points that were scanned, those in memory and those in files; return what was dropped as well.
+    """Return the fused cloud of all supported points that were scanned, and how many points were left out.
+
+    Support is decided for the points in memory. If these are all points, they are fused at once. Else the points are
+    read from the files, slab by slab across the part, and each takes the support of its neighbour in memory; threads
+    fuse several slabs at a time.
 
     Args:
-        slab: points that are fused at a time; with more of them the result is held in files without a name.
+        slab: points of a slab; a cloud of several slabs is held in temporary files.
 
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
@@ -83,7 +87,8 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     registered = replace(registered, poses=poses)
     cell = float(np.median([scan.scanned_spacing for scan in scans]))
     whole = has_whole_clouds(registered.session)
-    # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
+    # The edge of the square that a point in memory has for itself. Points in memory may stand in rows, so that it is
+    # not their spacing.
     place = float(np.sqrt(np.median([np.median(scan.area) for scan in scans]))) if whole else registered.capture.spacing
     placed = place_scans(scans, poses)
     support = find_support(scans, poses, placed, place)
@@ -124,12 +129,15 @@ def has_whole_clouds(session: SessionData) -> bool:
 
 
 def fuse(capture: Capture, poses: Array, cell: float | None = None, T_part: Array | None = None) -> FusedCloud:
-    """Average all points of all views in cells of `cell` (default: the scans' spacing) along the axes of T_part (4, 4),
-    T_reference_part (default: the part's own), in the reference frame.
+    """Return all points of all views averaged in cells of a grid, in the reference frame.
 
-    Returns:
-        Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
-        its normal (NaN where one view only), and the number of views per point.
+    `residual` is the rms distance of the views' surfaces from the fused one along its normal, length_unit, NaN where
+    one view alone shows it; `count` the number of views per point.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        cell: edge of a cell, length_unit; None: the scans' spacing.
+        T_part: (4, 4) T_reference_part, along whose axes the grid lies; None: the principal axes of the points.
     """
     T_part = part_axes(capture.scans, poses) if T_part is None else T_part
     placed = place_scans(capture.scans, frames.inverse(T_part) @ poses)
@@ -143,6 +151,7 @@ def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
 
 
 def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
+    """Return the points of view v under T (4, 4), with the weight by which each is averaged."""
     points, normals = frames.transform(T, scan.points), frames.rotate(T, scan.normals)
     # By their cosine of incidence, and by whether they lie on a smooth surface.
     weight = scan.confidence**2 * np.where(scan.usable, 1.0, _EDGE_WEIGHT)
@@ -150,9 +159,13 @@ def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
 
 
 def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
-    """Return (4, 4) T_reference_part: middle and principal axes of all points, the shortest first.
+    """Return T_reference_part (4, 4): centroid and principal axes of all points, the shortest first.
 
-    Which way an axis points makes no other cells; that it is told by the third moment keeps their order.
+    Each axis points to where the third moment is positive, so that the order of cells does not depend on how the part
+    lies; the last one makes the frame right-handed.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
     """
     points = np.concatenate([frames.transform(T, scan.points) for scan, T in zip(scans, poses, strict=True)])
     middle = centroid(points)
@@ -190,7 +203,10 @@ def _columns(rows: _Voxels | PlacedPoints) -> tuple[Array, ...]:
 
 
 def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
-    """Return the voxels of points of any views, given the cell of each (N,)."""
+    """Return per cell and view the weighted mean of the points there, given the number of each point's cell (N,).
+
+    Rows are sorted by cell, then by view.
+    """
     different, at = np.unique(cells, return_inverse=True)
     views = int(placed.view.max(initial=0)) + 1
     keys, at = np.unique(at * views + placed.view, return_inverse=True)
@@ -201,7 +217,10 @@ def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
 
 
 def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
-    """Return the mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
+    """Return per cell the mean point and normal over its views, and the rms distance of the views along the normal.
+
+    Cells are in the order of their numbers. The residual is NaN in a cell of one view.
+    """
     _, at = np.unique(voxels.cell, return_inverse=True)
     weight = np.bincount(at, voxels.weight)
     points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
@@ -246,8 +265,8 @@ class _Slabs:
 def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
     """Return slabs across the part's longest axis, each with about `slab` of the points that were scanned.
 
-    They consist of whole layers, one block thick, so that no block lies in two slabs. How many points a layer has is
-    told from those in memory, each of which stands for as many of its view as were scanned.
+    A slab consists of whole layers, one block thick, so that no block lies in two slabs. The points of a layer are
+    estimated from those in memory: each stands for its view's number scanned over its number in memory.
 
     Args:
         cell: edge of a cell, length_unit.
@@ -267,7 +286,7 @@ def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab
     for points, per_point in zip(clouds, scanned, strict=True):
         layer = (np.floor(points[:, axis] / thickness) - first).astype(np.int64)
         count += per_point * np.bincount(layer, minlength=layers)
-    # A layer belongs to the slab into which the middle one of its points falls, as they are counted from below.
+    # Points are counted from below: a layer belongs to the slab in which its middle point falls.
     slab_of_layer = np.floor((np.cumsum(count) - count / 2) / slab)
     ends = first + np.flatnonzero(np.diff(slab_of_layer) > 0) + 1
     # The outer slabs have no end: points that are not in memory may lie beyond those that are.
@@ -280,13 +299,13 @@ class _ViewInSlabs:
     def __init__(
         self, registered: RegisteredSession, v: int, slabs: _Slabs, alone: Mask, through: Mask, junk: float
     ) -> None:
-        """Take what slabs ask again and again.
+        """Prepare what every slab needs of view v: support of its points, their search tree, the slabs that it reaches.
 
         Args:
             slabs: the same for all views.
-            alone: points in memory on no surface.
-            through: those past which other views look.
-            junk: share of the points that stand alone.
+            alone: (N,) points in memory that lie on no surface.
+            through: (N,) points in memory that other views look through.
+            junk: share of the view's points that lie on no surface by a wide margin.
         """
         self.registered = registered
         self.v = v
@@ -314,11 +333,11 @@ class _ViewInSlabs:
         self.lock = Lock()
 
     def voxels(self, slab: int) -> tuple[_Voxels, Unsupported]:
-        """Return the voxels of a slab, and how many of its points support nothing: they are left out.
+        """Return the view's voxels of a slab, and how many of its points were left out without support.
 
-        Where memory holds the whole scan, its points are averaged by cell, and which of them are kept is known. Else
-        the points of the file are averaged, and each voxel has normal, weight and support of the nearest point in
-        memory; it stands alone where it lies too far from that, or too far off the surface there.
+        Where memory holds the whole scan, its supported points are averaged by cell. Else the points of the file are
+        averaged by cell; each voxel takes normal, weight and support from the nearest point in memory. It is left out
+        too where it lies too far from that point, or too far off its tangent plane.
         """
         axis = self.slabs.axis
         if self.whole is None:
@@ -351,9 +370,10 @@ class _ViewInSlabs:
         return voxels, Unsupported(len(voxel_of_point), int(count[alone].sum()), int(count[through].sum()))
 
     def _points_in(self, slab: int, whole: WholeCloud) -> tuple[PlacedPoints | None, list[Array]]:
-        """Return the view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
+        """Return the view's points in memory, None if the slab is empty, and x, y, z (N,) of its points in the slab.
 
-        Both in the frame of the slabs, and without the effects. Several slabs are read at a time, and wait here.
+        Both are in the frame of the slabs, with the effects in use taken out. The file is read for `_AHEAD` slabs at
+        once, whose points wait in `waiting`. The lock lets threads of other slabs wait for that reading.
         """
         if not self.first <= slab <= self.last:
             return None, [np.zeros(0)] * 3
@@ -368,7 +388,10 @@ class _ViewInSlabs:
         return in_memory if len(columns[0]) else None, columns
 
     def _cut(self, whole: WholeCloud, start: int, stop: int) -> dict[int, list[Array]]:
-        """Return the columns of slabs from `start` up to `stop`, by their numbers."""
+        """Return by slab, `start` to `stop` − 1, x, y, z (N,) of the view's points there, read from its file.
+
+        Effects in use and stock are taken out; `margin` says how far that may move a point across the slabs.
+        """
         cloud = whole.read()
         height = _along(self.T, cloud.points, self.slabs.axis)
         low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
@@ -386,7 +409,10 @@ class _ViewInSlabs:
         return {k: [c[order[a:b]] for c in columns] for k, (a, b) in enumerate(pairwise(ends), start)}
 
     def _corrected(self, cloud: Cloud, index: Indices) -> Array:
-        """Return some of the points, scanner frame, without the effects in use."""
+        """Return points `index` of a cloud (N, 3), scanner frame, with the effects in use taken out.
+
+        Normals, for the cosine of incidence, are those of the nearest points in memory.
+        """
         registered, terms = self.registered, self.registered.model.terms
         scan, scale = registered.measurement.capture.scans[self.v], registered.intensity_scale
         T = registered.capture.poses(registered.model.T_mount)[self.v]
@@ -404,7 +430,14 @@ class _ViewInSlabs:
         return np.concatenate(corrected)
 
     def _nearest(self, mean: Array, count: Indices) -> Indices:
-        """(G,) the point in memory that is nearest to the block in which a voxel lies."""
+        """Return per voxel (G,) the number of the point in memory nearest to the centroid of the voxel's block.
+
+        One look-up a block: blocks are no larger than the place of a point in memory.
+
+        Args:
+            mean: (G, 3) points of the voxels, frame of the slabs.
+            count: (G,) scanned points in each.
+        """
         cells = [c // self.slabs.block for c in self.slabs.cells(mean.T)]
         different, at = np.unique(pack_cells(cells, self.slabs.axis), return_inverse=True)
         middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]

@@ -42,10 +42,15 @@ class RangeImages:
     trusted: Mask  # (V,): looked from one eye
 
     def may_concern(self, scan: Scan, T: Array, centres: Array, radii: Array) -> Mask:
-        """(G,) whether a view may see, or see past, something in balls (G, 3), (G,) of the reference frame.
+        """Return a mask (G,) of the balls that a view may see or look through: in its field, and not too far off.
+
+        A quick test: balls it excludes need not be looked up in the range image.
 
         Args:
+            scan: the view's.
             T: (4, 4) T_reference_scanner of the view.
+            centres: (G, 3) of the balls, reference frame.
+            radii: (G,) length_unit.
         """
         away = frames.transform(frames.inverse(T), centres) - scan.eye
         far = np.linalg.norm(away, axis=1)
@@ -58,12 +63,17 @@ class RangeImages:
         return (far <= radii) | (inside & (far - radii <= farthest))
 
     def views_through(self, scan: Scan, T: Array, v: int, columns: Array, normals: Array, margin: float) -> Indices:
-        """(N,) 1 where view v looks past places with normals (N, 3), 2 where it ought to have seen one; else 0.
+        """Return per place (N,) 1 where view v measured a surface behind it, 2 where it ought to have seen it, else 0.
+
+        2: the place faces the view, lies within the measured ranges, and the view measured nothing around its ray. A
+        view that did not look from one eye (`trusted`) says nothing.
 
         Args:
-            T: (4, 4) T_reference_scanner of the view; places and normals are in the reference frame.
-            columns: (3, N) x, y, z of the places.
-            margin: by which a surface lies behind a place, length_unit.
+            scan: the view's.
+            T: (4, 4) T_reference_scanner of the view.
+            columns: (3, N) x, y, z of the places, reference frame.
+            normals: (N, 3) of the places, reference frame.
+            margin: least distance from a place to the surface behind it, length_unit.
         """
         through = np.zeros(columns.shape[1], np.int64)
         if not self.trusted[v]:
@@ -88,13 +98,17 @@ class RangeImages:
 
 
 def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> RangeImages:
-    """Return the range images of all views, of the points that are kept of each.
+    """Return the range images of all views over one common map of the scanner's field.
+
+    Rays are mapped stereographically about the mean ray of all views; bins are as large as the scans' angular spacing.
 
     Args:
-        cell: the smallest edge of a bin at the middle range, length_unit.
+        kept: per scan a mask of the points that count.
+        cell: smallest edge of a bin at the median range, length_unit.
     """
 
     def rays(scan: Scan, keep: Mask) -> tuple[Array, Array]:
+        """Return ranges (N,) and unit directions (N, 3), scanner frame, from the eye."""
         away = scan.points.compress(keep, axis=0) - scan.eye
         far = np.linalg.norm(away, axis=1)
         return far, away / far[:, None]
@@ -114,28 +128,33 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
         return x[:, :2] / np.maximum(1 + x[:, 2:], _BEHIND)
 
     maps = list(parallel(on_map, views))
-    # On the map lengths are half the angles, in the middle of the field.
+    # In the middle of the map a length is half the angle: hence the halves.
     angle = np.sqrt(np.median([scan.solid_angle for scan in scans]))
     size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2
     low = np.min([m.min(axis=0) for m in maps], axis=0) - 2 * size
     shape = tuple(((np.max([m.max(axis=0) for m in maps], axis=0) - low) / size).astype(int) + 3)
 
     def image_of(item: tuple[Array, Array]) -> tuple[Array, Mask, bool, Mask]:
-        """Nearest surface of closed bins, empty bins, whether the view is trusted, and bins that hold something."""
+        """Return one view's nearest range, empty bins, whether it is trusted, and occupied bins (H, W), from its rays.
+
+        The nearest range is that of nine bins, −inf where fewer than `_CLOSED` of them are occupied. A view is not
+        trusted if much of it lies behind its own surface: it did not look from one eye.
+        """
         m, far = item
         i, j = ((m - low) / size).astype(np.int64).T
         image = np.full(shape, np.inf)
         order = np.argsort(-far)
         image[i[order], j[order]] = far[order]
         least, filled = _of_nine_bins(image)
-        held = np.isfinite(image)
+        occupied = np.isfinite(image)
         trusted = np.mean(far > image[i, j] + 2 * _STEEPEST * size * far) < _MOST_BEHIND
-        return np.where(held & (filled >= _CLOSED), least, -np.inf), filled == 0, bool(trusted), held
+        return np.where(occupied & (filled >= _CLOSED), least, -np.inf), filled == 0, bool(trusted), occupied
 
-    nearest, empty, trusted, held = map(np.array, zip(*parallel(image_of, zip(maps, ranges, strict=True)), strict=True))
+    answers = parallel(image_of, zip(maps, ranges, strict=True))
+    nearest, empty, trusted, occupied = map(np.array, zip(*answers, strict=True))
     limits = np.array([np.quantile(far, (0.01, 0.99)) for far in ranges])
     reach = float(limits[:, 0].min()), float(limits[:, 1].max())
-    return RangeImages(axes, low, size, nearest, empty, field=held.sum(axis=0) >= 2, reach=reach, trusted=trusted)
+    return RangeImages(axes, low, size, nearest, empty, field=occupied.sum(axis=0) >= 2, reach=reach, trusted=trusted)
 
 
 def _axes_about(middle: Array) -> Array:
@@ -146,7 +165,7 @@ def _axes_about(middle: Array) -> Array:
 
 
 def _of_nine_bins(image: Array) -> tuple[Array, Indices]:
-    """Least value (H, W) of a bin and its eight neighbours, and how many of them hold one."""
+    """Return the least value (H, W) of each bin and its eight neighbours, and how many of the nine are finite."""
     padded = np.pad(image, 1, constant_values=np.inf)
     shifted = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     least, filled = np.full(image.shape, np.inf), np.zeros(image.shape, np.int64)

@@ -109,15 +109,19 @@ def register(
     method: Method = METHODS[DEFAULT],
     before: Overlaps | None = None,
 ) -> Registration:
-    """Move every view by its own twist until the overlaps agree, or until neither rms nor step falls any more.
+    """Return poses at which the overlaps agree, each view moved by its own twist and held by the robot's pose.
+
+    Each iteration matches points within the gate and takes one Gauss–Newton step. It ends when a step is small, or with
+    the best poses and a note: where neither rms nor step has fallen for `_PATIENCE` iterations, or at
+    `_MAXIMUM_ITERATIONS`.
 
     Args:
         model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
-        scatter: prior of the flange poses and the factor on the overlap noise.
-        gate: first distance between partners, length_unit.
-        start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
-        method: what every correspondence counts.
-        before: of the same points at poses near by: what cannot have changed is not searched again.
+        scatter: sigmas of the flange's poses (the prior), and the factor on the noise within overlaps.
+        gate: largest distance between corresponding points at first, length_unit.
+        start: (V, 4, 4) poses to begin with; None: the model's.
+        method: how correspondences are weighted.
+        before: overlaps at poses near by, whose search is used again; None: all is searched.
 
     Raises:
         NoResultError: no two views overlap.
@@ -171,7 +175,16 @@ class NormalEquations:
 def normal_equations(
     overlaps: Overlaps, capture: Capture, poses: Array, model_poses: Array, *, scatter: Repeatability, method: Method
 ) -> NormalEquations:
-    """Return what the overlaps say under a method's weights, and the robot's prior."""
+    """Return the normal equations of the views' twists: overlaps under a method's weights, plus the robot's prior.
+
+    Cost: Σ w e²/σ² + Σ_v (δ_v + δ⁰_v)ᵀ Λ_v (δ_v + δ⁰_v), with δ⁰ the twist from the model's pose to the present one.
+
+    Args:
+        overlaps: correspondences at `poses`.
+        poses: T_reference_scanner (V, 4, 4), about which the cost is linearised.
+        model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye, where the prior is centred.
+        scatter: sigmas of the flange's poses, and the factor on the noise within overlaps.
+    """
     old = overlaps.gram
     weights = method.weigh(overlaps.matches, capture, poses)
     surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
@@ -194,7 +207,7 @@ def normal_equations(
 
 
 def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
-    """Return the (V, 6, 6) inverse covariance of the views' twists about `centre`."""
+    """Return the inverse covariance (V, 6, 6) of the views' left twists about `centre` (3,) by the flange's scatter."""
     carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
     sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
     return np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)).astype(float, copy=False)
@@ -210,14 +223,17 @@ def with_free_mean(precision: Array, columns: Array) -> Array:
 def pose_covariance(
     overlaps: Overlaps, capture: Capture, poses: Array, T_mount: Array, scatter: Repeatability, method: Method
 ) -> Array:
-    """Return the covariance (6V, 6V) of what registered views turn and move about the centre of the overlaps.
+    """Return the covariance (6V, 6V) of the registered views' left twists about the centre of the overlaps.
 
-    The hand-eye is free, and no scan shows where all views stand: it holds for differences between them. A point's
-    noise is in every distance that the point has a part in, so that these are not independent: what each point pulls in
-    all of them counts, by the noise that its own scan shows (a sandwich, Liang and Zeger 1986, Biometrika 73:13).
+    It is H⁻¹ (M + K) H⁻¹, a sandwich (Liang and Zeger 1986, Biometrika 73:13). H are the normal equations; K is the
+    precision of the robot's poses with the hand-eye free, so that the result holds for differences between views. M is
+    the covariance of the gradient: the noise of one point enters all distances that the point has a part in, so the
+    gradient is summed per point first and then squared, by the noise of its scan.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner as registered.
+        T_mount: (4, 4) maps scanner to mount.
+        scatter: sigmas of the flange's poses, and the factor on the noise within overlaps.
     """
     g, size = overlaps.gram, 6 * len(poses)
     variance = g.variance * scatter.noise_factor
@@ -226,7 +242,8 @@ def pose_covariance(
     equations = normal_equations(overlaps, capture, poses, poses, scatter=scatter, method=method)
     inverse = symmetric_inverse(equations.H - block_diag(*prior) + K)
     weights = method.weigh(overlaps.matches, capture, poses)
-    # Offsets that cost nothing are unknowns too: what they take from a distance follows from their own sums.
+    # Free offsets of views are unknowns too. They are eliminated: `taken` says how much of their gradient the twists
+    # get.
     free = [v for v, scan in enumerate(capture.scans) if method.offsets and (scan.stock or v in equations.offsets)]
     sums = OffsetSums(g, overlaps.matches, weights, capture)
     taken = np.linalg.solve(sums.matrix[np.ix_(free, free)], sums.coupling.reshape(size, -1)[:, free].T)
@@ -257,7 +274,14 @@ class _Progress:
         self.stalled = 0
 
     def made(self, g: Gram, step: Array, gate: float) -> bool:
-        """Return True if one of both fell below all before; under a tighter gate they begin anew."""
+        """Return whether rms or step fell below all earlier ones, by a share of `_FALLS`; a tighter gate resets both.
+
+        `stalled` counts the calls in a row that returned False.
+
+        Args:
+            step: (V, 6) of this iteration; its size is the rms translation, length_unit.
+            gate: largest distance between corresponding points, length_unit.
+        """
         size = float(np.sqrt(np.mean(step[:, 3:] ** 2)))
         if gate < 0.9 * self.gate:
             self.rms, self.step, self.gate = np.inf, np.inf, gate
@@ -278,9 +302,13 @@ class _Progress:
 
 
 def unseen_moves(registration: Registration, model_poses: Array) -> Array:
-    """Return (V,) how far register moved each view along its surfaces, where no overlap shows it; length_unit.
+    """Return (V,) how far register moved each view in directions that its overlaps do not see, length_unit.
 
-    A ball turns and a cylinder slides on itself: such moves come from the noise and from the prior.
+    A ball can turn in itself, a cylinder slide: such moves come from noise and prior. Of each view, they are the
+    eigenvectors of the sum of its pairs' matrices whose eigenvalue is below `NEAR_NULL` of the largest.
+
+    Args:
+        model_poses: T_reference_scanner (V, 4, 4) before register; the motion common to all views does not count.
     """
     g = registration.overlaps.gram
     blocks = np.zeros((g.views, 6, 6))
@@ -296,9 +324,14 @@ def unseen_moves(registration: Registration, model_poses: Array) -> Array:
 
 
 def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
-    """Return poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
+    """Return poses (V, 4, 4) moved by each view's most likely error, and the residual distances (V, S) of its targets.
 
-    The most likely twist of a view is C·leverᵀ·V⁻¹·(−residual) (best linear unbiased prediction, Robinson 1991).
+    The most likely left twist of a view is C·Lᵀ·Σ⁻¹·(−e), the best linear unbiased prediction (Robinson 1991): C is the
+    covariance of its twist by the flange's scatter, L the lever, Σ the covariance of its residuals e.
+
+    Args:
+        variances: (3,) of rotation scatter (rad²), translation scatter (length_unit²), factor on the sensor's noise.
+        poses: T_reference_scanner (V, 4, 4) of the model.
     """
     V = len(rows.lever)
     to_centre = frames.make(np.eye(3), -rows.centre)

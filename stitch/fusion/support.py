@@ -84,16 +84,20 @@ class Support:
 
 
 def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell: float) -> Support:
-    """Return which points of the views are supported.
+    """Return which points of the views are supported, and which are left out for what reason.
+
+    Three questions, in this order. Does another view show the same surface in the same cell (settled)? If not, does the
+    point lie on a surface of its own view's neighbours, or of all views' (held)? If held but not settled, do other
+    views look through it?
 
     Args:
         poses: (V, 4, 4) T_reference_scanner.
-        placed: the points of the scans by these poses, one view after the other.
-        cell: edge of the cells in which views meet, length_unit.
+        placed: the points of the scans under these poses, one view after the other.
+        cell: edge of the cells in which views are compared, length_unit.
     """
     settled, scatter = _points_on_surface(placed, cell)
     parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
-    # What a view full of junk says of itself is not believed beyond what the others say of the same scanner.
+    # A view full of stray points overestimates its own noise and spacing: both are limited by the other views'.
     noise = _limited([scan.noise for scan in scans])
     angles = _limited([scan.solid_angle for scan in scans])
     tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, noise, angles, strict=True)))
@@ -129,7 +133,14 @@ def edge_credit(junk: float) -> float:
 
 
 def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
-    """Points in whose cell another view shows the same surface (N,), and the scatter of views across it."""
+    """Return a mask (N,) of the points on a surface that another view shows in the same cell, and the scatter.
+
+    The scatter, length_unit, is the robust sigma of points of several views about the mean plane of their cell. A point
+    on an edge needs two other views.
+
+    Args:
+        cell: edge of the cells, length_unit.
+    """
     views = int(placed.view.max()) + 1
     _, at = np.unique(cell_numbers(placed.points, cell), return_inverse=True)
     weight = np.bincount(at, placed.weight)
@@ -163,11 +174,15 @@ def _limited(values: Sequence[float]) -> Array:
 
 
 def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float) -> tuple[Mask, float]:
-    """Points (N,) of a scan that are settled or lie on a surface of their neighbours, and the share that is alone.
+    """Return a mask (N,) of points that are settled or lie on a surface of their neighbours, and the share of strays.
+
+    A stray has more than `_ALONE` times the usual solid angle for itself. The more strays, the less far a point may lie
+    off the plane of its neighbours where the surface ends (`edge_credit`).
 
     Args:
+        settled: (N,) points that another view confirms: they are not tested.
         noise: of the scan across a surface, length_unit.
-        angle_each: solid angle that a point on a smooth surface has for itself.
+        angle_each: solid angle (sr) that a point on a smooth surface has for itself.
     """
     held = np.ones(len(scan.points), bool)
     asked = np.flatnonzero(~settled)
@@ -185,7 +200,7 @@ def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float
     around = scan.points.take(index, axis=0) - scan.points.take(asked, axis=0)[:, None]
     centroid = around.mean(axis=1)
     normals = scan.normals.take(index, axis=0)
-    # What the first round throws out supports nothing in the second.
+    # Points that the first round rejects do not count as neighbours in the second.
     for _ in range(2):
         local = _LocalSurface(around, normals, vote * held[index])
         aside = np.linalg.norm(centroid - np.einsum("ij,ij->i", centroid, local.normal)[:, None] * local.normal, axis=1)
@@ -220,14 +235,20 @@ class _LocalSurface:
 
 
 def _masked_median(values: Array, counts: Mask) -> Array:
-    """(N,) lower median of those values (N, k) that count; a large number where none does."""
+    """Return the lower median (N,) of those values (N, k) that count; `_NONE`, a huge number, where none does."""
     ordered = np.sort(np.where(counts, values, _NONE), axis=1)
     middle = np.maximum(counts.sum(axis=1) - 1, 0) // 2
     return np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0]
 
 
 def _held_by_all_views(placed: PlacedPoints, held: Mask, scatter: float, cell: float) -> Mask:
-    """Points (N,) that lie on a surface of the held points of all views, though not on one of their own view."""
+    """Return a mask (N,) of points not held so far that lie on a surface of the held points of all views.
+
+    Args:
+        held: (N,) points on a surface of their own view, or settled.
+        scatter: of several views across a surface, length_unit.
+        cell: edge of the cells, length_unit; neighbours lie within `_NEAR` of these.
+    """
     on_surface = np.zeros_like(held)
     asked = np.flatnonzero(~held)
     base = np.flatnonzero(held)
@@ -253,7 +274,19 @@ def _looked_through(
     asked: Indices,
     cell: float,
 ) -> Mask:
-    """(A,) of the points `asked` those past which views look, alone or as a body that hangs together with nothing."""
+    """Return a mask (A,) of the points `asked` that other views look through, singly or as part of a loose body.
+
+    Singly: `_PAST` views measured a surface behind the point, one on an edge. A loose body is a group of a view's
+    points, apart from all others, that hardly any second view confirms and that some views look through.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        held: (N,) points on a surface.
+        settled: (N,) points that another view confirms.
+        asked: (A,) numbers of the points to test.
+        cell: edge of the cells, length_unit.
+    """
+    # A range image needs points of every view.
     kept = np.split(held, np.cumsum([len(scan.points) for scan in scans])[:-1])
     if not all(keep.any() for keep in kept):
         return np.zeros(len(asked), bool)
@@ -263,6 +296,7 @@ def _looked_through(
     columns = np.ascontiguousarray(points.T)
 
     def by_view(v: int) -> tuple[Indices, Indices]:
+        """Return which of the points asked view v may concern, and its answer on each (`views_through`)."""
         concerned = images.may_concern(scans[v], poses[v], centres, radii)
         concerned[v] = False
         near = np.flatnonzero(concerned[view])
@@ -279,14 +313,14 @@ def _looked_through(
     loose = np.zeros(len(held), bool)
     ends = np.cumsum([0, *(len(scan.points) for scan in scans)])
     for v in np.flatnonzero(np.bincount(view[contradicted[asked]]) > _WITNESSES):
-        # What stands in the way of one view may stand near what others show.
+        # Bodies are sought among the points of one view: in all views a stray body may touch the part.
         rows = ends[v] + np.flatnonzero(kept[v])
         loose[rows] = _in_loose_body(placed.points[rows], settled[rows], contradicted[rows], cell)
     return through | loose[asked]
 
 
 def _balls_around(points: Array, view: Indices, views: int) -> tuple[Array, Array]:
-    """Centres (V, 3) and radii (V,) of balls around each view's points."""
+    """Return centres (V, 3) and radii (V,) of balls around each view's points (N, 3), given the view (N,) of each."""
     count = np.maximum(np.bincount(view, minlength=views), 1)
     centres = np.stack([np.bincount(view, column, views) for column in points.T], axis=1) / count[:, None]
     radii = np.zeros(views)
@@ -295,7 +329,17 @@ def _balls_around(points: Array, view: Indices, views: int) -> tuple[Array, Arra
 
 
 def _in_loose_body(points: Array, settled: Mask, contradicted: Mask, cell: float) -> Mask:
-    """(N,) points of a view in bodies that hang together with nothing that is seen twice, and past which views look."""
+    """Return a mask (N,) of a view's points in loose bodies: seen by hardly any second view, and looked through.
+
+    Bodies are connected components of occupied cells whose edge is `_GAP` · cell: wider gaps separate them.
+
+    Args:
+        points: (N, 3) reference frame.
+        settled: (N,) points that another view confirms.
+        contradicted: (N,) points that another view looks through or ought to have seen.
+        cell: length_unit.
+    """
+    # Imported here, since few sessions need it.
     from scipy.ndimage import label
 
     step = max(_GAP * cell, *(float(np.ptp(column)) / _STEPS for column in points.T))
