@@ -30,6 +30,7 @@ PLACEMENT, SCANNER_PLACEMENT = "axis_placement", "scanner_placement"
 )
 def axis_placement(motion: AxisMotion, views: Views, tilt: Array, shift: Array, turn: Array) -> AxisMotion:
     """axis truly along exp(tilt) and through the point + shift, both across it"""
+    # Two components across each axis, axis after axis; a twist has its rotation first.
     placement = motion.placement.copy()
     rotary = views.axes.rotary
     placement[rotary, :2] += tilt.reshape(-1, 2)

@@ -187,7 +187,7 @@ def part_slip(views: Views, xi: Array, v: float) -> Array:
 def part_growth(points: Array, view: ScanView, g: float, c: Array) -> Array:
     """x = x* + ((x*−o)·g + c)·ΔT, o the flange or the middle of the scans; ΔT of part_temperature_c, else hours
 
-    Scaled about its frame's origin, where no session says: the point at −c/g from o stands still.
+    The point o − c/g stands still: a part is seldom clamped exactly at o.
     """
     return points + ((points - view.origin) * g + c) * float(warmer(view.views, "part_temperature_c")[view.index])
 

@@ -28,7 +28,7 @@ _FIX = "to fix: write the effect into a file, and load it with stitch.effects.us
 
 
 def source_of(effects: Sequence[Effect]) -> str:
-    """Return the text of a Python file that defines these effects.
+    """Return the text of a Python file that, executed alone, defines these effects: functions, imports and constants.
 
     Raises:
         InputError: the source of a function is not at hand, or it names what no file could hold.

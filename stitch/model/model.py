@@ -88,7 +88,7 @@ class Term(Value):
         return self.effect.arguments(self.parameters)
 
     def at(self, values: Array, sigmas: Array | None = None) -> "Term":
-        """Return the term with other values (P,), and sigmas (P,) where they are known.
+        """Return the term with other values (P,), and other sigmas (P,); None: these stay.
 
         Example:
             >>> better.terms[0].at(np.zeros(1)).values
@@ -187,7 +187,7 @@ class Model(Value):
         return self.with_terms([term for term in self.terms if term.name != name])
 
     def with_term(self, term: Term) -> "Model":
-        """Return the model with a term in place of its own of the same effect, as the last.
+        """Return the model with a term added as the last one; its term of the same effect, if any, is dropped.
 
         Example:
             >>> run.model.with_term(better.model.terms[0]).effects

@@ -95,7 +95,10 @@ def vertex_columns(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_ply(path: Path, elements: Mapping[str, NDArray[np.void]]) -> None:
-    """Write structured arrays by the name of their element; a field of k numbers becomes a list."""
+    """Write element name -> structured array (N,) as a binary little endian PLY; its fields are the properties.
+
+    A field of k numbers becomes a list of length k.
+    """
     with path.open("wb") as out:
         out.write(ply_header({name: (rows.dtype, len(rows)) for name, rows in elements.items()}))
         for rows in elements.values():
@@ -103,7 +106,7 @@ def write_ply(path: Path, elements: Mapping[str, NDArray[np.void]]) -> None:
 
 
 def ply_header(elements: Mapping[str, tuple[np.dtype[np.void], int]]) -> bytes:
-    """Return the header of a binary little endian file whose elements have these fields and counts."""
+    """Return the header of a binary little endian PLY, from element name -> (dtype of a row, number of rows)."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for element, (layout, count) in elements.items():
         lines.append(f"element {element} {count}")

@@ -57,7 +57,11 @@ _CODE_REST = 0.02
 
 @readable()
 def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
-    """Return the scan of a file; `scale` turns the file's unit into the session's. Points at 0 0 0 are left out.
+    """Return the scan of a file, of any known format; points at 0 0 0, which measured nothing, are left out.
+
+    Args:
+        path: its ending says the format.
+        scale: factor from the file's unit to the session's length_unit.
 
     Raises:
         InputError: missing or broken file, no x, y, z, no points, or points that are not finite.

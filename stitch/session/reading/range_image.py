@@ -103,7 +103,10 @@ def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) ->
 
 
 def _array_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
-    """Read (H, W, 3) without brightness, (H, W, 4) with it, (H, W, 6) with red, green and blue."""
+    """Return points (H, W, 3) and brightness (H, W) of a .npy: x, y, z and then nothing, grey, or red, green, blue.
+
+    None for both where it holds no image of points; None for a brightness that it does not hold.
+    """
     array = np.load(path, allow_pickle=False)
     if array.ndim != 3 or array.shape[2] < 3:
         return None, None

@@ -132,7 +132,14 @@ def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
 
 
 def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
-    """Return the finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
+    """Return the finite number, shape (), or three numbers, shape (3,), at `key` of a table; 0 where absent.
+
+    Args:
+        where: names the table in the message.
+
+    Raises:
+        InputError: another shape, or a number that is not finite or above `LARGEST`.
+    """
     try:
         value = np.array(table.get(key, np.zeros(shape)), float)
     except (TypeError, ValueError, OverflowError):

@@ -61,7 +61,7 @@ def load_session(
     Args:
         path: the folder.
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
-        start: (n,) joint angles, rad, of a single view that stands in for views.csv, which is not read then.
+        start: (n,) joint angles, rad, of a single view that stands in for the rows of views.csv; None: these count.
         at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
         memory: bytes for a run of the session; may allow fewer points than `at_most`; None: not limited.
         only: name of the single view that is read; None: all.

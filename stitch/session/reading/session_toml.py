@@ -49,10 +49,10 @@ _AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
 
 
 def read_session_document(file: Path) -> dict[str, Any]:
-    """Return the document, with known tables and keys only.
+    """Return the content of session.toml; all its tables and keys are known ones.
 
     Raises:
-        InputError: missing, not TOML, of another format, or with a key that nobody knows.
+        InputError: missing, not TOML, of another format, or with an unknown key; says what the folder looks like.
     """
     hint = "a session is a folder with session.toml and views.csv"
     if any(file.parent.glob("*/session.toml")):
@@ -277,7 +277,9 @@ def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:
 
 
 def read_robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
-    """Return the robot of [robot], by its DH rows or URDF; None without one.
+    """Return the robot that [robot] describes by DH rows or a URDF; lengths in the unit `unit`.
+
+    None without such a table, and where it states the repeatability alone.
 
     Raises:
         InputError: a value that cannot be, and how to fix it.
@@ -305,7 +307,9 @@ def read_robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | N
 
 
 def read_repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatability:
-    """Return [robot] repeatability = { position, rotation_mrad }; position in length_unit.
+    """Return the repeatability that [robot] states as { position, rotation_mrad }, in length_unit and rad.
+
+    What it does not state is None.
 
     Raises:
         InputError: another key, or no positive number.
