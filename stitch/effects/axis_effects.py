@@ -55,7 +55,7 @@ def scanner_placement(views: Views, r: Array, t: Array) -> Array:
 @effect("axis", needs=("rotary_axis",), A=per_axis("rotary", "mm", 0.05, 2.0), B=per_axis("rotary", "mm", 0.05, 2.0))
 def axis_eccentricity(motion: AxisMotion, views: Views, A: Array, B: Array) -> AxisMotion:
     """centre off by A (sin θ, cos θ) + B (cos θ, −sin θ), θ the reading"""
-    return replace(motion, error=motion.error + _against(motion, views, A, B, (3, 4)))
+    return replace(motion, error=motion.error + _counter_rotating(motion, views, A, B, (3, 4)))
 
 
 @effect(
@@ -63,10 +63,10 @@ def axis_eccentricity(motion: AxisMotion, views: Views, A: Array, B: Array) -> A
 )
 def axis_wobble(motion: AxisMotion, views: Views, A: Array, B: Array) -> AxisMotion:
     """axis tilts by A (sin θ, cos θ) + B (cos θ, −sin θ), θ the reading"""
-    return replace(motion, error=motion.error + _against(motion, views, A, B, (0, 1)))
+    return replace(motion, error=motion.error + _counter_rotating(motion, views, A, B, (0, 1)))
 
 
-def _against(motion: AxisMotion, views: Views, A: Array, B: Array, sides: Sequence[int]) -> Array:
+def _counter_rotating(motion: AxisMotion, views: Views, A: Array, B: Array, sides: Sequence[int]) -> Array:
     """Return twists (V, K, 6) in the axes' frames that turn once a turn against the part on a rotary axis.
 
     Component sides[0] is A sin θ + B cos θ, sides[1] is A cos θ − B sin θ, θ the reading; zero for linear axes.

@@ -73,6 +73,7 @@ def scan_odometry(
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
 
+    # KISS-ICP takes lengths for metres of a street: points and motions are scaled to that size, poses back.
     scale = _STREET / float(np.median([size_of_scan(points) for points in scans]))
     config = KISSConfig()
     # Its sums over several threads have no fixed order, so their last digits would change from run to run.

@@ -186,17 +186,18 @@ def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
 
     All blocks are joined into one.
     """
-    free = np.linalg.svd(column_space(flatten_blocks(mixed.A)), full_matrices=True)
-    turn = free[0][:, free[1].size :].T
+    # The columns of U beyond the rank are orthogonal to the mean's columns.
+    U, singular, _ = np.linalg.svd(column_space(flatten_blocks(mixed.A)), full_matrices=True)
+    to_complement = U[:, singular.size :].T
     roots = []
     for blocks in mixed.components:
-        C = turn @ (blocks[0] if len(blocks) == 1 else block_diag(*blocks)) @ turn.T
+        C = to_complement @ (blocks[0] if len(blocks) == 1 else block_diag(*blocks)) @ to_complement.T
         values, vectors = np.linalg.eigh(C)
         keep = values > _ROUNDING * float(np.max(values, initial=1e-300))
         roots.append(vectors[:, keep] * np.sqrt(values[keep]))
-    n = len(turn)
-    fixed = np.zeros((n, n)) if mixed.fixed is None else turn @ block_diag(*mixed.fixed) @ turn.T
-    return _MeanFreeData(turn @ mixed.z.ravel(), np.array([root @ root.T for root in roots]), roots, fixed)
+    n = len(to_complement)
+    fixed = np.zeros((n, n)) if mixed.fixed is None else to_complement @ block_diag(*mixed.fixed) @ to_complement.T
+    return _MeanFreeData(to_complement @ mixed.z.ravel(), np.array([root @ root.T for root in roots]), roots, fixed)
 
 
 def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
@@ -207,6 +208,7 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
     Args:
         likeliest: (c,) variances at the maximum; that of the noise centres its grid.
     """
+    # Scatter may be anything up to far above all that was seen: its grid is centred at 1e-4 of its share of Σz².
     usual = 1e-4 * usual_variances(mixed.z, mixed.components)
     usual[NOISE] = likeliest[NOISE]
     if mixed.further is not None:
@@ -218,9 +220,12 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
 def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, density: Array) -> Array:
     """Return the posterior probabilities (g,) of the values of variance i on its grid, given the other variances.
 
-    V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
+    V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ = R Rᵀ: one decomposition for the whole grid.
+    With m and v eigenvalues and vectors of RᵀR, t = 1 + (λ − λ_i) m and a = vᵀRᵀL⁻¹z, the log likelihood is
+    −½ Σ (log t + a²/m (1/t − 1)) up to a constant.
 
     Args:
+        data: observations z, components C and square roots of these.
         current: (c,) variances now.
         grid: (g,) values of variance i.
         density: (g,) its log prior there.
@@ -238,7 +243,7 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
     values, vectors = np.linalg.eigh(root.T @ root)
     values = np.maximum(values, 1e-300)
     along = vectors.T @ (root.T @ z)
-    # Rounding must not take away more than there is.
+    # By rounding the covariance could lose its last positive part.
     times = np.maximum(1 + (grid[:, None] - current[i]) * values, 1e-12)
     logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)
     weights = np.exp(logs - logs.max())

@@ -14,7 +14,7 @@ from stitch.session.session import SessionData
 _FEWEST = 4
 
 
-def stand_still(session: SessionData) -> SessionData:
+def deskew_session(session: SessionData) -> SessionData:
     """Return the session with each point in the frame of the scanner at the time of its view, not at its own time.
 
     The robot's path is a spline through the poses of the views. The hand-eye that turns it into the scanner's path is

@@ -79,10 +79,10 @@ def _base_moments(robot: Robot, joints: Array, payload: Array | None) -> dict[st
     Args:
         payload: (V,) kg; None: the mass in [robot] payload.
     """
-    of_kg = kinematics.base_moments(robot, joints)[..., :2]
+    of_kg = kinematics.base_moments(robot, joints)[..., :2]  # (V, n + 1, 2) of 1 kg at each link, the payload's last
     load = np.full(len(joints), robot.payload_mass) if payload is None else payload
     moments = load[:, None] * of_kg[:, -1]
-    columns = list[tuple[str, int, Array]]()
+    columns = list[tuple[str, int, Array]]()  # name, axis and moments (V,) of each
     if robot.has_masses:
         moments = moments + np.einsum("k,vki->vi", robot.mass, of_kg[:, :-1])
     else:

@@ -158,7 +158,7 @@ def _mat_bytes(path: Path) -> int:
     """
     total, size = 0, path.stat().st_size
     with path.open("rb") as stream:
-        head = stream.read(_MAT_HEADER)
+        head = stream.read(_MAT_HEADER)  # its last two bytes tell the byte order
         order = ">" if head[126:] == b"MI" else "<"
         if head[126:] not in (b"MI", b"IM"):
             return 0

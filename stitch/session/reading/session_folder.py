@@ -17,7 +17,7 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.axis_poses import place_stated_axes, require_placed
-from stitch.session.moving_scanner import stand_still
+from stitch.session.moving_scanner import deskew_session
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.csv_files import read_csv_lines
 from stitch.session.reading.scale_checks import check_scale, require_near
@@ -115,7 +115,7 @@ def load_session(
     if scans:
         check_scale(session, cloud_unit)
     # One view alone says nothing of how the robot moved.
-    return stand_still(session) if scanner.moving and scans and only is None else session
+    return deskew_session(session) if scanner.moving and scans and only is None else session
 
 
 def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:
