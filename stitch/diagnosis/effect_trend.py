@@ -97,8 +97,11 @@ class EffectTrend:
 
 
 def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
-    """Return the trends of the candidates of which something was fitted, over the dots of the first of them."""
-    # As the field of the part predicts it: beside scatter alone, hand-eye and effects in use fitted anew.
+    """Return the trends of the candidates that can be fitted, by name; all are drawn over the dots of the first one.
+
+    Empty where nothing can be fitted or drawn.
+    """
+    # Poses scatter independently here, as for the field of the part, so that both pictures predict the same.
     fitted = linear.restricted(())
     asked = [scored for scored in scores if scored.fitted]
     anew = [scored if fitted is linear else score(fitted, scored.candidate) for scored in asked]
@@ -124,9 +127,14 @@ class ExpectedView:
 def expected_in_view(
     linear: LinearModel, rivals: Sequence[Score], joints: Array, wait: float = 0.0
 ) -> ExpectedView | None:
-    """Return what candidates for the same dots expect at joint angles (n,), `wait` s later than usual.
+    """Return what rival effects predict for the dot of one further view.
 
-    None where nobody says how it would look there: of labelled points, of effects of points, along gravity.
+    None where that cannot be computed: for labelled points, effects that change points, and dots drawn along gravity.
+
+    Args:
+        rivals: scores of the effects; the first chooses direction and axis, as in the plot.
+        joints: (n,) joint angles of the view, rad.
+        wait: s, beside the usual pause before the view.
     """
     fitted = linear.restricted(())
     surfaces = surfaces_of(fitted)
@@ -143,10 +151,11 @@ def expected_in_view(
         at = float(measurement.views.time[0])
     elif follows == "view order":
         at = float(linear.measurement.views.count)
+    # Twists count as displacements: rotations (rad) times the part's reach. `along` projects a twist on the direction.
     rim = np.repeat([surfaces.reach, 1.0], 3)
     unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * rim
     along = unit * rim / max(float(unit @ unit), 1e-300)
-    # A dot is what the model without any candidate leaves.
+    # A dot is what the model without any candidate leaves: its prediction is subtracted from the rivals'.
     without = fitted.baseline_trial.solve()
     expected = {}
     for scored, prediction in zip(rivals, predict_views(linear, rivals, joints[None], np.array([wait])), strict=True):
@@ -157,7 +166,10 @@ def expected_in_view(
 
 
 def _view_scatter(linear: LinearModel, scored: Score, measurement: Measurement) -> Array:
-    """Return (6, 6) by which the twist of a further view scatters by itself, beside a candidate."""
+    """Return the covariance (6, 6) of a further view's twist by the flange's scatter, with a candidate in the model.
+
+    The twist is about the part's centre, reference frame, rotation first; rad and length_unit.
+    """
     base = model_beside(linear, scored)
     flange = build_capture("candidate", (), measurement.T_base_flange, measurement.mount).T_reference_flange
     carried = frames.adjoint(frames.make(np.eye(3), -base.observation.centre) @ flange)[0]
@@ -166,7 +178,10 @@ def _view_scatter(linear: LinearModel, scored: Score, measurement: Measurement) 
 
 
 def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement, centre: Array) -> Array:
-    """Return (6,) the twist of a further view by a unit of what is drawn."""
+    """Return the twist (6,) of a further view per unit of the motion that is drawn, about `centre`, reference frame.
+
+    A joint turns by 1 rad, the mount by its unit twist; any other body moves along the direction, alike in all views.
+    """
     bare = Model(linear.model.T_mount)
     if motion.joint is not None:
         return next(pose_derivatives(measurement, bare, [_zero(linear, EFFECTS["joint_offset"])], centre))[
@@ -178,19 +193,20 @@ def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement
 
 
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
-    """Return the trend of an effect that is in the model, over what these views show without it.
+    """Return the trend of an effect that is in the model: dots as if it were not, its line, and the dots with it.
 
-    None for one that changes points.
+    What the effect explains is added to the observations again, and its columns are taken out of the design. None for
+    an effect that changes points, or of which nothing was fitted.
     """
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
     norms = np.linalg.norm(fitted.design, axis=0)
-    # Its parameters that the fit holds at zero have columns too.
+    # All columns of the effect, also of parameters that the fit holds at zero: they are found in the design by value.
     own = fitted.responses([term])[0].columns
     others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], own, 1e-6 * norms[j])]
-    # What was seen is counted from the model, which holds the effect.
+    # Observations are residuals from the model, which has the effect: its share is added back.
     seen = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
     without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=seen))
     effect = _Effect(term, form, _change(without, form.columns, without))
@@ -204,8 +220,12 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
 
 
 def _clearest_joint(effect: "_Effect") -> "_Effect":
-    """Return the effect of that joint alone which is the most of its own sigmas from zero; as it is without joints."""
+    """Return an effect of several joints reduced to the joint that differs most from zero; any other as it is.
+
+    The measure is vᵀ C⁻¹ v, with values v of that joint's free parameters and their covariance C.
+    """
     term, change = effect.term, effect.change
+    # From the index of a parameter to that among the free ones.
     place = np.cumsum(effect.form.keep) - 1
     joints = [[i for i in joint if effect.form.keep[i]] for joint in by_joint(term.effect, term.parameters)]
     joints = [joint for joint in joints if joint]
@@ -227,13 +247,13 @@ def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
 
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
-    """Return how far a joint is off along what its error follows without a name, beside its mean."""
+    """Return the trend of a joint whose error follows its angle, time or another quantity by no known law."""
     error = np.interp(curve.view_values, curve.at, curve.error)
     return _trend_of_joint(linear, linear, curve.joint, error, (*_axis_words(curve.covariate), curve.view_values))
 
 
 def trend_of_law(linear: LinearModel, ranked: Ranked) -> EffectTrend | None:
-    """Return how far a joint is off along what it follows by a law of the dictionary; None for a law elsewhere."""
+    """Return the trend of a joint that follows a quantity by a law of the dictionary; None for a law elsewhere."""
     law, scored = law_of(ranked), ranked.score
     if law.place.joint is None:
         return None
@@ -254,14 +274,17 @@ def _axis_words(covariate: str) -> tuple[str, str]:
 def _trend_of_joint(
     linear: LinearModel, scatter: LinearModel, number: int, error: Array, axis: _Axis
 ) -> EffectTrend | None:
-    """Return the trend of an error (V,) rad of one joint, counted from 1, that no effect of the library makes.
+    """Return the trend of an error of one joint that no effect of the library makes; None if it moves no view.
 
     Args:
-        scatter: with the variances of what is independent between views.
+        scatter: the model with the variances of what is independent between views.
+        number: of the joint, counted from 1.
+        error: (V,) rad, the shape of the error; its size and a constant are fitted.
+        axis: what the trend is drawn over.
     """
     fitted = linear.restricted(())
     turned = _joint_columns(fitted)[:, number - 1 : number]
-    # Beside its zero, of which such an error says nothing.
+    # With a constant, since the zero of the joint is not known either.
     shapes = np.column_stack([error, np.ones_like(error)])
     response = turned * _of_rows(fitted, shapes, len(turned))
     columns = _displacements(fitted, turned)[..., 0]
@@ -272,7 +295,10 @@ def _trend_of_joint(
 
 
 def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:
-    """Return where the views lie off along what their displacement follows without a name, and its means in bins."""
+    """Return the trend of the views' displacement along the covariate that it depends on; the line joins means of bins.
+
+    The standard deviation of a dot is that of all dots about the line.
+    """
     predicted = np.interp(dependence.at, dependence.bins, dependence.mean)
     sigma = float(np.std(dependence.moved - predicted, ddof=1)) if len(predicted) > 1 else 0.0
     trend = EffectTrend(
@@ -324,12 +350,14 @@ class _Change:
 
 
 def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change:
-    """Return what further columns (n, p) change.
+    """Return the fit of further columns in a linear model: values, covariance, and what they change in its prediction.
 
     Args:
-        beside: the same with the variances that are left beside them.
+        columns: (n, p) reduced observations per unit of each parameter.
+        beside: the model with the variances that remain beside these columns, for the covariance.
     """
     white = linear.whiten(columns)
+    # What hand-eye and effects in use take up of each column, in units of their parameters.
     absorbed = np.column_stack([fit_columns(linear.white_design, column) for column in white.T]).astype(float)
     residual = beside.residual(columns)
     values = fit_columns(linear.residual(columns), linear.white_residual)
@@ -347,14 +375,17 @@ class _Effect:
 
 
 def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
-    """Return the effect of a score, its best form fitted to the views beside a linear model."""
+    """Return the best form of a score fitted to a linear model, at the variances of the score if it has any."""
     beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
     change = _change(linear, scored.form.columns, beside)
     return _Effect(scored.form.at(change.values), scored.form, change)
 
 
 def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
-    """Return the motion that an effect is drawn along, and what it is drawn over."""
+    """Return the motion along which an effect is drawn, and the axis over which.
+
+    The sign is chosen so that the largest displacement is positive; the turn of a joint keeps its own sign.
+    """
     motion = _motion(linear, effect)
     line = motion.line
     if motion.joint is None and line[np.argmax(np.abs(line))] < 0:
@@ -364,7 +395,7 @@ def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
 
 
 def _trend_on(plot: "_Plot", effect: _Effect) -> EffectTrend:
-    """Return an effect over the dots of a plot."""
+    """Return the trend of an effect over the dots of a plot, which another effect may have chosen."""
     motion = _motion(plot.linear, effect)
     square = np.sum(motion.columns**2, axis=1)
     line = motion.line / np.maximum(square, 1e-2 * np.median(square))
@@ -392,7 +423,7 @@ class _Plot:
         return np.maximum(square, 1e-2 * np.median(square))
 
     def along(self, numbers: Array) -> Array:
-        """(V, P) what reduced observations (n, P) displace along the direction."""
+        """Return displacements (V, P) of the views along the direction by reduced observations (n, P), per column."""
         moved = _displacements(self.linear, self.linear.observation.expand(numbers))
         return np.einsum("vk,vkp->vp", self.motion.columns, moved) / self.square[:, None]
 
@@ -425,24 +456,31 @@ class _Plot:
 
 
 def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
-    """Return the dots of a direction, what the model leaves of each view; None where nothing moves along it.
+    """Return the dots of a plot: what a model leaves of each view along a motion, with sigma; None if it moves no view.
 
     Args:
-        scatter: with the variances of what is independent between views.
+        linear: the model, without any candidate.
+        scatter: the model with the variances of what is independent between views.
+        motion: what is off.
+        axis: what the plot is drawn over.
     """
     if not motion.columns.any():
         return None
     plot = _Plot(linear, motion, axis, np.zeros(0), np.zeros(0))
     explained = linear.design @ linear.baseline_trial.solve()[-linear.design.shape[1] :]
     left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
-    # Each number of a block moves views of its own block alone, but for the mean of all.
+    # With cov = half halfᵀ, sigma² is the sum over columns of `half`. Columns are those of all blocks side by side:
+    # an observation moves views of its own block alone, but for the mean of all.
     half = np.linalg.cholesky(_independent(scatter)).reshape(len(left), -1).astype(float)
     sigma = np.sqrt(np.sum(plot.along(half) ** 2, axis=1))
     return replace(plot, measured=plot.along(left[:, None])[:, 0], sigma=sigma)
 
 
 def _independent(linear: LinearModel) -> Array:
-    """Return (B, m, m) covariance of what is independent between views: scatter of flange and joints, and noise."""
+    """Return the covariance (B, m, m) of what is independent between views: scatter of flange and joints, and noise.
+
+    There are B blocks of m reduced observations. A small multiple of the identity keeps it positive definite.
+    """
     names = linear.component_names
     some = [*range(NOISE + 1), *(NOISE + 1 + k for k, name in enumerate(names) if name == JOINT_SCATTER)]
     covariance = np.einsum("c,cbij->bij", linear.null.variances[some], linear.mixed.components[some])
@@ -451,13 +489,18 @@ def _independent(linear: LinearModel) -> Array:
 
 
 def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
-    """Return the motion along which an effect is drawn: of one joint, of the mount, else where it moves views most."""
+    """Return the motion along which an effect is drawn, by the place where it acts.
+
+    Effects of joints: the turn of the joint that moves the views most. Effects of the mount: its twist in the view that
+    moves most, less the mean. All others: the first principal direction of the views' displacements.
+    """
     term = effect.term
     response = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
     unit = linear.measurement.length_unit
     if term.effect.place == "robot":
         turned = _joint_columns(linear)
         errors = _joint_errors(linear.measurement.views, term)
+        # Square sums of the reduced observations tell how much each joint is seen to move.
         reduced = linear.reduce(turned * _of_rows(linear, errors, len(turned)))
         joint = int(np.argmax(np.sum(reduced**2, axis=0)))
         columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
@@ -497,8 +540,10 @@ def _of_rows(linear: LinearModel, values: Array, count: int) -> Array:
 
 
 def _displacements(linear: LinearModel, response: Array) -> Array:
-    """Return (V, k, P) displacements at the part of responses (·, P); of surfaces a turn counts by what it does at the
-    rim."""
+    """Return displacements (V, k, P) of the views at the part, length_unit, by responses (·, P), one a parameter.
+
+    Of surfaces they are twists (k = 6) with rotations times the part's reach; of labelled points, k = 3 translations.
+    """
     observation = linear.observation
     surfaces = surfaces_of(linear)
     if surfaces is None:
@@ -535,7 +580,11 @@ def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
 
 
 def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
-    """Return over what an effect of a joint, counted from 0, is drawn: torque, last move, speed, or else its angle."""
+    """Return the axis of an effect of one joint: words, unit, and values (V,) of its torque, move, speed or angle.
+
+    Args:
+        joint: counted from 0.
+    """
     number = joint + 1
     bending = [k for k, bent in enumerate(views.torques.joint) if bent == joint]
     if "torque" in term.effect.needs and bending:
@@ -554,8 +603,16 @@ def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
 def _trends_of_points(
     linear: LinearModel, effects: Sequence[_Effect], scores: Sequence[Score]
 ) -> dict[str, EffectTrend]:
-    """Return means over bins of points of what the model without any candidate leaves along the motion of the first,
-    and of what each candidate takes of it."""
+    """Return trends of effects that change points, by name: means over bins of points in place of dots of views.
+
+    Dots are the remaining distances divided by the cosine between the first effect's motion and the normal. A line is
+    the part of them that each effect explains. Its sigma is |line| / √W, with the Wald statistic W = vᵀ C⁻¹ v of the
+    effect's values v. Empty without clouds.
+
+    Args:
+        effects: fitted effects; the first chooses motion and axis.
+        scores: of these effects, in the same order.
+    """
     surfaces = surfaces_of(linear)
     left = predicted_distances(linear)
     if surfaces is None or left is None:
@@ -608,8 +665,14 @@ def _owner(term: Term) -> str:
 
 
 def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, count: int) -> list[Any]:
-    """Return of points (N,) of some of `count` correspondences: where each stands along what the effect lives on, the
-    cosine of the effect's motion to the normal, the number of the correspondence, and the point's view."""
+    """Return four arrays (N,) on the points of at most `_ASKED` correspondences, those of both views.
+
+    They are: the value of what the effect depends on, the signed cosine between the effect's motion and the normal, the
+    number of the correspondence, and the point's view. The sign is that of the distance, first view less second.
+
+    Args:
+        count: number of all correspondences.
+    """
     poses = surfaces.capture.poses(linear.model.T_mount)
     matches = surfaces.unconstrained.overlaps.matches
     step = max(count // _ASKED, 1)
@@ -628,7 +691,10 @@ def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: 
 
 
 def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array:
-    """Return (N, 3) where an effect moves points to, scanner frame: along the rays where it does so."""
+    """Return unit vectors (N, 3) of the direction in which an effect moves points, scanner frame.
+
+    If more than 90 % of the squared motion lies along the rays, these are returned: their sign is the same everywhere.
+    """
     moved = -point_correction([term], points, view, pose)
     rays: Array = view.along(points)
     along = np.einsum("ni,ni->n", moved, rays)
@@ -639,7 +705,14 @@ def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array
 
 
 def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
-    """Return (N,) where points stand along what an effect of points lives on."""
+    """Return values (N,) of what an effect of points depends on: distance, angle (degrees), height, temperature …
+
+    Args:
+        name: of the effect; unknown ones get the angle from the middle of the field.
+        points: (N, 3), scanner frame.
+        view: what is known of the scan and its points.
+        pose: (4, 4) T_reference_scanner.
+    """
     match name:
         case "range_scale" | "range_nonlinearity":
             return np.linalg.norm(view.away(points), axis=1)
@@ -664,12 +737,25 @@ def _bins(at: Array, cosine: Array) -> list[Mask]:
 
 
 def _means(bins: Sequence[Mask], cosine: Array, distances: Array) -> Array:
-    """Return (D,) motion of the points of each bin that makes distances (N,)."""
+    """Return the motion (D,) of each bin's points by least squares: Σ cosine · distance / Σ cosine².
+
+    Args:
+        bins: D masks (N,).
+        cosine: (N,) between the motion and the normal.
+        distances: (N,) along the normal, length_unit.
+    """
     return np.array([np.sum(cosine[b] * distances[b]) / np.sum(cosine[b] ** 2) for b in bins])
 
 
 def _scatter(bins: Sequence[Mask], cosine: Array, remaining: Array, view_of: Indices) -> Array:
-    """Return (D,) standard deviation of the means by the scatter of the views' own, where an effect leaves no more."""
+    """Return the standard deviation (D,) of `_means`, views as the independent samples.
+
+    With t_v = Σ cosine · (distance − cosine · mean) over the points of view v, it is √(Σ t_v²) / Σ cosine².
+
+    Args:
+        remaining: (N,) distances that the effect leaves, length_unit.
+        view_of: (N,) view of each point.
+    """
     sigma = []
     for b, off in zip(bins, _means(bins, cosine, remaining), strict=True):
         top = np.bincount(view_of[b], (cosine * remaining)[b])

@@ -53,9 +53,13 @@ _ONE_WAY, _FEWEST_MOVES = 0.95, 3
 def gather_evidence(
     linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit, overlap_misfit: float = 0.0
 ) -> Evidence:
-    """Return all that the views say for and against every effect; the verdict follows from it.
+    """Return the evidence for and against every effect, after all questions; the verdict is a property of it.
+
+    First the questions of `NAMING` propose a name, then those of `TESTS` try to refute it.
 
     Args:
+        candidates: effects that could be missing.
+        limit: scatter of the flange poses that no sound arm exceeds.
         overlap_misfit: rms that no motion of the views removes (`overlap_misfit_beyond_noise`), length_unit.
     """
     case = Case(linear, candidates, dictionary_of(linear, candidates))
@@ -70,10 +74,11 @@ def gather_evidence(
 def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
     """Does it hold on views left out and in halves of the views?
 
-    Every effect that may be named is asked beside all that it was named beside or, where pose errors have no prior,
-    alone, as it would be added next. A second effect takes the place of a first that does not hold, where the second
-    holds alone too and is certain there.
+    Every effect that may be named is cross-validated. Where pose errors have a prior, the effects it was named beside
+    are in the model; else it is tested alone, as it would be added next. If the first effect fails and the second
+    holds, the second is named, provided that it is certain and holds alone.
     """
+    # A score with `base_model` was made beside other effects.
     effects = _named_effects(evidence)
     alone = {r.name: r for r in evidence.ranked}
     asked = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
@@ -117,7 +122,8 @@ def does_the_scanner_explain_it(case: Case, evidence: Evidence) -> Reply | None:
 def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: does a name that fell hold beside a second effect?
 
-    What that one did made the first another in each half of the views, or looked like a smooth error of the scanner.
+    A second effect that is not in the model can make the first look different in each half of the views, or look like
+    a smooth error of the scanner. Then a name that was refuted is proposed again, with the second.
     """
     proposed = evidence.proposed
     if proposed is None or proposed.verdict != "missing_effect" or evidence.named or case.many_views:
@@ -132,11 +138,12 @@ def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
 def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     """Which contenders predict views left out as well as a single name, or better?
 
-    These views cannot tell it from those. One that predicts them clearly better and stands every other test takes the
-    place of the name: a Bayes factor charges for plausible sizes that may be wrong, as a user's are, and what was not
-    seen does not. What a second effect leaves on views left out may hide by how much the first predicts them better.
-    What begins at some view may begin at nearly the first, where it is what lasts, and views left out beside a jump say
-    little of it: of such the odds decide.
+    Such contenders form a group with the name that cannot be told apart. One that predicts clearly better and passes
+    the other tests is named instead: a Bayes factor depends on assumed plausible sizes, a prediction does not. If there
+    are rivals as good, a second missing effect may hide the difference: then a pair is tried first.
+
+    A rival must be within 20 to 1 of the name where either of the two is an event. An event near the first view is the
+    same as a lasting effect, and views left out near an event say little of it.
     """
     if evidence.verdict != "missing_effect" or evidence.second is not None:
         return None
@@ -165,7 +172,8 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
 def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | None:
     """Is an effect that alone explains more than the name not needed beside what is named?
 
-    If it is wanted all the same, these views cannot tell the two apart, or of few views both are missing.
+    If it is certain even with the named effect in the model, there are two cases. Of few views, if the name is certain
+    beside it too, both are missing; otherwise these views cannot tell the two apart.
     """
     first = evidence.ranked[0]
     named = evidence.named[:1]
@@ -188,8 +196,10 @@ def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | N
 def does_the_arm_do_what_hangs_at_it(case: Case, evidence: Evidence) -> Reply | None:
     """Does an effect of the arm do what hangs at it is said to do, or what hangs at it the jump of a joint?
 
-    Over a sweep of few joints gravity bends either alike, and reflectors weigh grams: these views cannot tell. Nor does
-    any view tell a step of the last joint from a part that turned about its axis.
+    Two cases arise. For labelled points, a mount or part that droops under gravity may be an arm that does: over few
+    joints both follow the same curve. And a jump of a joint may be a jump of the part or the mount: no view tells a
+    step of the last joint from a part that turned about its axis. Contenders of the other kind whose pattern correlates
+    beyond a limit form a group with the name.
     """
     linear = case.linear
     if evidence.verdict != "missing_effect":
@@ -234,8 +244,9 @@ def is_its_size_believable(case: Case, evidence: Evidence) -> Reply | None:
 def does_a_joint_turn_back(case: Case, evidence: Evidence) -> Reply | None:
     """Does a joint turn back where a jump in time is named, so that this session cannot tell the two apart?
 
-    A path that was driven once shows both at the same view. A jump that is missing beside other effects is not added
-    with them.
+    If joints change their direction at the view of the jump, backlash would show there too. Backlash is then named with
+    the jump as a group; where it cannot be tested, the finding has no name. A jump among further missing effects is
+    only taken out of these.
     """
     if evidence.verdict != "missing_effect":
         return None
@@ -260,7 +271,8 @@ def does_a_joint_turn_back(case: Case, evidence: Evidence) -> Reply | None:
 def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
     """Where a joint errs: does the base do as much about the same axis, and follow the same?
 
-    Of an effect with a name only where it follows nothing of the joints, which the base knows nothing of.
+    The base cannot follow a joint's own angle or torque. So for a named effect only laws of a joint that follow
+    something else, such as time, are compared; without a name, all laws that are told.
     """
     said_by = case.dictionary.said_by
     if evidence.named and not evidence.second:
@@ -319,12 +331,12 @@ def overlap_misfit_beyond_noise(linear: LinearModel, stated_noise: float | None 
 
 
 def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) -> FieldError | None:
-    """Return smooth errors of the scans where they are larger than every scanner's; None where overlaps show no such.
+    """Return smooth errors of the scans if they are larger than those of usual scanners; None if they are not.
 
-    It may be small beside the noise: many points average that, and not what is the same in every view.
+    They may be smaller than the noise of a point, which many points average away. None also without overlaps of clouds.
 
     Args:
-        other_terms: effects of points that may have any size.
+        other_terms: effects of points, fitted beside the error with any size.
     """
     surfaces = surfaces_of(linear)
     if surfaces is None:
@@ -334,7 +346,7 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
 
 
 def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
-    """Return whether each of two effects holds on views left out beside the other, beside which it was scored."""
+    """Return whether each of two effects predicts views left out with the other in the model, where it was scored."""
     return not any(
         _objection(one, cross_validate(conditioned_on_effects(linear, [other]), one.score))
         for one, other in (pair, pair[::-1])
@@ -346,7 +358,13 @@ def _named_effects(evidence: Evidence) -> list[Ranked]:
 
 
 def _objection(effect: Ranked, left_out: CrossValidation) -> str | None:
-    """Return why an effect does not hold on views left out or in halves of the views; None where it does."""
+    """Return the reason, as text, to reject an effect: it rests on one view, predicts no others, or differs in halves.
+
+    None where it passes all three tests.
+
+    Args:
+        left_out: its cross-validation.
+    """
     if left_out.steadiness < limits.MIN_STEADINESS:
         return f"{effect.name} rests on one view: without it {max(left_out.steadiness, 0):.0%} of the effect remain"
     if not left_out.helps:
@@ -356,14 +374,20 @@ def _objection(effect: Ranked, left_out: CrossValidation) -> str | None:
 
 
 def _scanner_error_in_place_of(linear: LinearModel, evidence: Evidence) -> FieldError | None:
-    """Return smooth errors of the scans that explain as much as what is named; None where they explain less."""
+    """Return smooth errors of the scans if they explain at least as much as the effect that is named; else None.
+
+    Named effects that change points are fitted beside the error: it may not claim what they explain.
+    """
     terms = [r.score.form.term for r in _named_effects(evidence)]
     error = find_scanner_error(linear, other_terms=[term for term in terms if moves_points([term])])
     return error if scanner_explains_it(replace(evidence, scanner_error=error)) else None
 
 
 def _pair_that_stands(case: Case, evidence: Evidence) -> tuple[Ranked, Ranked] | None:
-    """Return the first of the explanation with a second effect, where both stand every test beside each other."""
+    """Return the first effect of the explanation and a second one, if both pass every test beside each other.
+
+    None where there is no second effect, where it replaces the first, or where the scanner explains as much.
+    """
     named = evidence.explanation[0]
     pair = find_missing_pair(case.linear, case.candidates, named)
     if pair is None or pair[0].name != named.name or not pair_is_validated(case.linear, pair):
@@ -373,7 +397,10 @@ def _pair_that_stands(case: Case, evidence: Evidence) -> tuple[Ranked, Ranked] |
 
 
 def _coincidence(views: Views, ranked: Ranked) -> str:
-    """Return what else begins where an effect jumps; empty where it does not, or nothing does."""
+    """Return a text on joints that change their direction at the view where an effect jumps; "" without such.
+
+    It is "" also for an effect without a jump.
+    """
     event = next((p for p in ranked.score.form.term.parameters if p.discrete), None)
     joints = [] if event is None else _joints_turning_at(views, event.value)
     if event is None or not joints:
@@ -383,10 +410,12 @@ def _coincidence(views: Views, ranked: Ranked) -> str:
 
 
 def _joints_turning_at(views: Views, first: float) -> list[int]:
-    """Return the joints, counted from 1, that come from one side before a view and from the other side from there on.
+    """Return the joints, counted from 1, whose moves go one way before a view and the other way from it on.
+
+    On each side at least `_ONE_WAY` of at least `_FEWEST_MOVES` moves must go the same way.
 
     Args:
-        first: number of the view, as events count it.
+        first: number of the view at which an event begins.
     """
     joints, after = list[int](), views.number >= first
     for joint, approach in enumerate(views.approach.T, 1):

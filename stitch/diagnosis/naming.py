@@ -73,10 +73,10 @@ def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: S
 
 
 def propose(case: Case, limit: ScatterLimit) -> Evidence:
-    """Return the evidence after the questions that lead to a name, which nothing has been held against yet.
+    """Return the evidence after the questions of `NAMING`, which propose a name that is not tested yet.
 
     Args:
-        limit: what the poses of an arm may scatter.
+        limit: scatter of the flange poses that no sound arm exceeds.
     """
     ranked, empirical = rank_all(case.linear, case.candidates)
     laws = rank_laws(case.linear, case.dictionary)
@@ -92,7 +92,10 @@ def propose(case: Case, limit: ScatterLimit) -> Evidence:
 
 
 def ask(questions: Sequence[Question], case: Case, evidence: Evidence) -> Evidence:
-    """Return the evidence after questions that were asked in order, with their answers."""
+    """Return the evidence after asking questions in order; each one sees what those before it changed.
+
+    A question that does not arise leaves no answer; a reply with `ends` skips those behind it.
+    """
     for question in questions:
         reply = question(case, evidence)
         if reply is None:
@@ -104,7 +107,10 @@ def ask(questions: Sequence[Question], case: Case, evidence: Evidence) -> Eviden
 
 
 def answered(evidence: Evidence, question: Callable[..., object], reply: Reply) -> Evidence:
-    """Return the evidence with what a reply changes, and with the answer; a docstring's first line is the question."""
+    """Return the evidence with a reply's changes and with its answer recorded.
+
+    The first line of the question's docstring is recorded as its text, and whether the reply changed verdict or names.
+    """
     after = replace(evidence, **reply.changes)
     changed = after.verdict != evidence.verdict or [r.name for r in after.named] != [r.name for r in evidence.named]
     sentence = (question.__doc__ or "").strip().splitlines()[0]
@@ -138,11 +144,13 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     if not contenders:
         return Reply("none that could be named", ends=True)
     first = contenders[0]
+    # Random effects of the arm in the model can explain what a further contender would: without those of the known
+    # contenders it may show. Each one found may reveal more.
     while hidden := _hidden_contenders(case, contenders):
         contenders += hidden
     base = case.linear.without([r.name for r in contenders])
     if len(contenders) > 1 and base is not case.linear:
-        # There their Bayes factors are over one and the same.
+        # All are scored over the same null model, so that their Bayes factors compare.
         contenders = [rescored_in(base, r) for r in contenders]
     ranked = _with_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
@@ -173,6 +181,7 @@ def which_hold_together(case: Case, evidence: Evidence) -> Reply | None:
     shape = evidence.shape
     selection = forward_selection(case.linear, case.candidates, best)
     explained = max(selection.explained, best.log_posterior)
+    # The changes for an alarm without a name.
     nothing = {"explanation": (), "together": (), **_refusals(selection.refused)}
     if shape is not None and shape.log_posterior > explained + limits.ODDS:
         return Reply("none: a shape without a cause explains more", nothing, ends=True)
@@ -201,7 +210,8 @@ def do_poses_err_without_a_name(case: Case, evidence: Evidence) -> Reply | None:
 def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: does something without a name explain them as well, alone and beside a second effect?
 
-    Two known effects at once may look like none of them: the best is tried with a second one.
+    "Without a name" is an error of a joint or in time that follows no law of the library. Two known effects at once may
+    look like such an error: the best effect is tried with a second one before it loses.
     """
     if case.many_views:
         return None
@@ -223,8 +233,8 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
 def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply | None:
     """Is it wanted beside the others and beside any trend without a name, of a joint or in time?
 
-    A trend that is as likely is a rival: these views cannot tell it from the effect. One that is likelier explains them
-    instead.
+    Let f be the effect's log Bayes factor with the most favourable such trend in the model. Beyond log 20 the effect is
+    needed. Between ± log 20 the trend is a rival that these views cannot exclude. Below, the trend is the explanation.
     """
     if regime_of(case.linear).prior:
         return None  # the prior of pose errors has asked already
@@ -281,8 +291,15 @@ NAMING: tuple[Question, ...] = (
 
 
 def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]:
-    """Return effects that could be named only where no contender is among the errors that remain: a base that gives
-    way, or an uneven gear, explains nothing beside joints that may give way by as much as the views show."""
+    """Return contenders that show only once the random effects of the known contenders are taken out of the model.
+
+    A compliant base or an uneven gear, say, explains nothing while joints may give way by any amount. Scored again are
+    effects that are random effects of the model themselves, and the most promising of the others. Empty where the
+    model has no random effects of these names.
+
+    Args:
+        contenders: effects that could be named already; not empty.
+    """
     known = {r.name for r in contenders}
     base = case.linear.without(known)
     if base is case.linear:
@@ -296,11 +313,14 @@ def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]
 
 
 def _with_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
-    """Return the ranking with those contenders that were none in it; posterior shares make room for them.
+    """Return the ranking with hidden contenders at their new place; all posteriors are normalised again.
+
+    Ranking and contenders were scored in different models. Differences to `first`, which is in both, are carried over.
 
     Args:
-        first: the contender that was the likeliest.
-        contenders: as they are scored now.
+        ranked: all effects as they were ranked, hidden ones too low.
+        first: the contender that was the likeliest there.
+        contenders: all contenders, as they are scored now.
     """
     now = {r.name: r for r in contenders}
     hidden = [now[r.name] for r in ranked if r.name in now and not is_contender(r)]
@@ -321,7 +341,10 @@ def _with_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[R
 
 
 def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
-    """Return a candidate scored in another model; it counts among as many as before."""
+    """Return a candidate scored in another linear model, with the same number of tests and the same prior.
+
+    Its `posterior` stays that of the old ranking.
+    """
     again = score(base, ranked.score.candidate)
     return replace(
         ranked,
@@ -332,11 +355,16 @@ def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
 
 
 def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
-    """Return effects of which some are wanted though none is alone, likeliest first; () if the views do without any.
+    """Return effects of which at least one is needed though none is certain by itself, likeliest first; () if none is.
+
+    Random effects of joints and links can explain whatever one effect would. All are removed first: if an effect is
+    certain then, they are put back, and removed one by one (that with the largest gain first) until it is certain. The
+    removed ones form the group. It is () where an unmodelled error explains the views as well.
 
     Args:
-        tests: candidates among which the best is chosen.
+        tests: number of candidates among which the best is chosen.
     """
+    # Names of effects that are random effects of the model.
     families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
     without_families = linear.without(families)
     if not families or without_families.null.deviance < linear.null.deviance:
@@ -360,12 +388,12 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
         return ()
     near = [r for r in again if is_contender(r) and r.comes_near(again[0])]
-    # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
+    # One far ahead is no name either: it was not certain with the others as random effects. Then all are returned.
     return tuple(near) if len(near) > 1 else again
 
 
 def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
-    """Return the effect that explains most beside the best one, if it is certain."""
+    """Return the likeliest effect that is certain with the best one in the model; None where there is none."""
     others = [c for c in candidates if c.name != best.name and not c.empirical]
     ranked, _ = rank_all(conditioned_on_effects(linear, [best]), others)
     return next((r for r in ranked if is_certain(r)), None)
@@ -374,9 +402,10 @@ def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], bes
 def find_missing_pair(
     linear: LinearModel, candidates: Sequence[Candidate], best: Ranked
 ) -> tuple[Ranked, Ranked] | None:
-    """Return two effects where one alone took for itself what both do, each scored beside the other.
+    """Return two missing effects, each scored with the other in the model; None where there is no such pair.
 
-    Each must be certain beside the other, and beside the second no other may come near the first.
+    The second is the likeliest beside `best`; the first, usually `best` again, is the likeliest beside the second. Each
+    must be certain beside the other, and beside the second no other contender may be within 20 to 1 of the first.
     """
     second = find_second_effect(linear, candidates, best)
     if second is None:
@@ -392,13 +421,13 @@ def find_missing_pair(
 
 
 def _beaten_by_unmodelled(known: float, evidence: Evidence) -> bool:
-    """Return whether something without a name does what effects of the library do.
+    """Return whether an error without a name is too likely for known effects to be named.
 
-    A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows nothing that has a name must be
-    20 to 1 less likely, as all others that might have the name.
+    A shape without a cause wins if it is 20 to 1 likelier. An unmodelled error of a joint or in time wins unless it is
+    20 to 1 less likely, as any other rival would.
 
     Args:
-        known: log posterior of the effects.
+        known: log posterior of the effects that would be named.
     """
     shape = evidence.shape
     by_shape = shape is not None and shape.log_posterior > known + limits.ODDS
@@ -406,7 +435,7 @@ def _beaten_by_unmodelled(known: float, evidence: Evidence) -> bool:
 
 
 def _refusals(refused: Mapping[str, str]) -> dict[str, Any]:
-    """Return the changes; what speaks against several effects is said once."""
+    """Return the changes of the evidence by refused effects: the reasons by name, and each reason once as a note."""
     return {"refused": refused, "notes": tuple(dict.fromkeys(refused.values()))}
 
 

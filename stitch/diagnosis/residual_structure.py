@@ -56,17 +56,21 @@ class BudgetLine:
 def variance_budget(
     linear: LinearModel, named: Sequence[Score] = (), trend: FittedProcess | None = None
 ) -> tuple[BudgetLine, ...]:
-    """Return shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
+    """Return the sources of the views' pose errors with their shares of the variance, largest first.
+
+    Sources are the effects in the model, those named as missing, a trend in time, and the components of what remains.
+    A source's square is that of its reduced observations, without the part that the hand-eye can imitate. () where
+    pose errors have no prior (many views, labelled points).
 
     Args:
-        named: candidates that are said to be missing: what they explain is theirs.
-        trend: of the flange in time, where one is said to be there.
+        named: candidates that are said to be missing.
+        trend: of the flange in time, where one is reported; None: none is.
     """
     if linear.pose_errors is None:
         return ()
     surfaces = surfaces_of(linear)
     if linear.mixed.fixed is not None and surfaces is not None:
-        # Smooth errors of the scanner as the overlaps show them; an alarm allows for larger ones.
+        # The model holds the scanner's smooth errors at a cautious size; here they have that which the overlaps show.
         field = linear.reduce(field_scatter(linear.measurement, surfaces.unconstrained, share=None))
         linear = replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
     hand_eye = linear.reduce(linear.design[:, :6])
@@ -94,7 +98,14 @@ def variance_budget(
 
 
 def _remaining_squares(linear: LinearModel, explained: Sequence[Array]) -> list[tuple[str, float]]:
-    """Return sums of squares that each component leaves beside the model and what columns explain."""
+    """Return (source, sum of squares) of each variance component in what remains beside the model and further columns.
+
+    For a component of variance σ² and covariance C it is σ² tr((I − U Uᵀ) C), U an orthonormal basis of the columns of
+    the model and of `explained`.
+
+    Args:
+        explained: matrices (n, p) of the reduced observations that other sources explain.
+    """
     errors = linear.pose_errors
     assert errors is not None
     U = column_space(np.hstack([linear.reduce(linear.design), *explained]))
@@ -113,16 +124,15 @@ def _remaining_squares(linear: LinearModel, explained: Sequence[Array]) -> list[
 
 
 def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingError]) -> bool:
-    """Return whether the scanner's field is the likeliest of all shapes without a cause, 20 to 1 over errors of poses
-    that repeat.
+    """Return whether an unnamed error over the scanner's field explains the views best, by 20 to 1.
 
-    A scanner whose axes are of unequal scale or not at right angles, or with a plane of focus that is bent to one side,
-    errs by where in its field a point is seen, by no law of the library: the same in every view, so that overlaps show
-    it, and joints, mount or time only seem to have a part in it.
+    It must be the first of the empirical shapes, significant, and 20 to 1 likelier than the next shape and than every
+    repeating error of the poses. Such an error is the same in every view, such as axes of unequal scale: overlaps show
+    it, and joints, mount or time only seem to cause it.
 
     Args:
-        empirical: best first.
-        repeating: what poses do again without a name; both are over scatter and what an arm usually errs by.
+        empirical: shapes without a cause, best first.
+        repeating: repeating errors of poses without a name; Bayes factors of both are over the same null model.
     """
     best = next(iter(empirical), None)
     if best is None or best.name.partition("@")[0] != FIELD or best.adjusted >= ALPHA_UNKNOWN:
@@ -134,17 +144,16 @@ def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingErro
 def predicted_distances(
     linear: LinearModel, scored: Score | None = None, matches: Sequence[Match] | None = None
 ) -> Array | None:
-    """Return (M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
+    """Return signed distances (M,) of all correspondences as predicted with a candidate in the model, length_unit.
 
-    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
-    scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
-    no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
-    independently than beside all that an arm may do, and that one `add` reaches.
-
-    In the order of the matches. None without clouds.
+    The prediction is linear; hand-eye, effects in use and the candidate are fitted together. Poses scatter
+    independently in this fit, as in that of `add`. The candidate is scored again for it, since another of its forms may
+    fit best there than beside random effects of the arm. None without clouds.
 
     Args:
-        matches: of the same views; None: of the free network.
+        scored: the candidate; None: the model alone.
+        matches: correspondences of the same views, whose order is that of the result. None: those of the network of
+            overlaps that moved the views without the robot.
     """
     surfaces = surfaces_of(linear)
     if surfaces is None:
@@ -170,7 +179,7 @@ def predicted_distances(
     overlaps = surfaces.unconstrained.overlaps
     matches = overlaps.matches if matches is None else matches
     centre, of_views = overlaps.gram.centre, twists.reshape(-1, 6)
-    # B(δ_v − δ_w) of the normal equations, not by moving the views: where hand-eye and links can stand in for one
-    # another, both move far and their common motion alone counts.
+    # Distances change by B (δ_v − δ_w), B the rows of the plane distances, δ the twists of the views. The views
+    # themselves are not moved: where hand-eye and links imitate each other, both move far, beyond what is linear.
     along = [frames.plane_rows(m.middle - centre, m.normal) @ (of_views[m.v] - of_views[m.w]) for m in matches]
     return signed_distances(matches, poses, points) + np.concatenate(along)
