@@ -214,7 +214,7 @@ def source_trial(job: Row) -> Row:
     )
     exact = replace(places, sources=known, scan_errors=None)
     slopes = number_table(features.features, result.fits)[-1]
-    true = slopes @ np.vstack([exact.loadings(fit.at, fit.gradient)[0] for fit in result.fits])
+    true = slopes @ np.vstack([exact.loadings(fit.at, fit.gradient) for fit in result.fits])
     rows = []
     for number, (robot, incidence), value in zip(result.numbers, true.tolist(), truth, strict=True):
         shares = [sum(number.shares.get(name, 0.0) for name in names) for names in PARTS.values()]

@@ -41,6 +41,8 @@ FINE = len(_LEGENDRE_ORDERS)
 SHARED, INCIDENCE, PER_VIEW = range(3)
 # What every scanner has, as a share of its noise along the ray, and the spread of its logarithm; what is asked at all.
 USUAL_SHARE, SHARE_SPREAD, SHARE_BOUNDS = 0.3, 0.7, (0.01, 10.0)
+# Sizes over which a posterior is integrated, in that spread from the usual one.
+_SIZE_SIGMAS = np.linspace(-4.0, 4.0, 33)
 # Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
 # effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.
 ALARM_SHARE = 0.5
@@ -273,17 +275,30 @@ class SmoothErrorLikelihood:
         bounds = [tuple(np.log(SHARE_BOUNDS))] * len(start)
         return np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
-    def share_spread(self, shares: Array) -> Array:
-        """Return standard deviations (C,) of the logarithms of the shares (C,), from the posterior's curvature there.
+    def error_moments(self, cause: int, shares: Array) -> tuple[Array, Array, float]:
+        """Return mean (K_c,) and second moment (K_c, K_c) of the errors f of one cause, over the noise, and its degrees
+        of freedom: those of a variance are twice its square over its own variance (JCGM 100, G.4).
 
-        The curvature of −log posterior is a central difference of the slopes of −2 log likelihood, plus the prior's.
+        The size s of the errors is integrated over its posterior, the other causes having shares (C,):
+        E[ffᵀ] = ∫ p(s) (f̂f̂ᵀ + C) ds, with C = (A + 1/s²)⁻¹, f̂ = C b and p(s) ∝ |1 + s²A|^(−1/2) exp(½ bᵀf̂) π(s), for
+        A = TᵀB⁻¹T and b = TᵀB⁻¹d of data d with covariance B but for the errors T f (Box and Tiao 1973, 5.2).
         """
-        logs, step = np.log(shares), 1e-3 * np.eye(len(shares))
-        slopes = [self._deviance(logs + s)[1] - self._deviance(logs - s)[1] for s in step]
-        curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / SHARE_SPREAD**2
-        # Where the likelihood bends the other way the prior alone counts.
-        values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-        return np.sqrt((vectors**2) @ (1 / np.maximum(values, SHARE_SPREAD**-2.0)))
+        others = np.where(np.arange(len(shares)) == cause, 0.0, shares)
+        solved = np.linalg.solve(self._data_covariance(others), self.design[cause])
+        # Independent of each other along the eigenvectors of A.
+        information, axes = np.linalg.eigh(self.design[cause].T @ solved)
+        pull = axes.T @ (solved.T @ self.data)
+        squares = USUAL_SHARE**2 * np.exp(2 * SHARE_SPREAD * _SIZE_SIGMAS)[:, None]
+        growth = 1 + squares * np.maximum(information, 0.0)
+        variance = squares / growth
+        mean = variance * pull
+        log_posterior = -0.5 * (np.log(growth).sum(axis=1) - mean @ pull + _SIZE_SIGMAS**2)
+        weights = np.exp(log_posterior - log_posterior.max())
+        weights /= weights.sum()
+        moment = (mean.T * weights) @ mean + np.diag(weights @ variance)
+        total = (mean**2 + variance).sum(axis=1)
+        scatter = max(float(weights @ (total - weights @ total) ** 2), 1e-300)
+        return axes @ (weights @ mean), axes @ moment @ axes.T, float(2 * (weights @ total) ** 2 / scatter)
 
     def ml_shares(self, limits: Mapping[int, float] | None = None) -> tuple[Array, float]:
         """Return the shares (C,) of maximum likelihood, and −2 log likelihood there.

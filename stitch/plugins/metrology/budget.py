@@ -143,8 +143,9 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     aligned = free_of_datum(slopes, fits, places.centre, datum_rows(quantities, wanted.datum))
     slopes = aligned @ slopes
     counted = replace(places, sources=_not_stated(places, wanted))
-    of_fits, noise = zip(*(counted.loadings(fit.at, fit.gradient) for fit in fits), strict=True)
-    variances, vectors = np.linalg.eigh(block_diag(*noise))
+    of_fits = [counted.loadings(fit.at, fit.gradient) for fit in fits]
+    own = [fit.slopes * fit.noise for fit in fits]
+    variances, vectors = np.linalg.eigh(block_diag(*(by_point @ by_point.T for by_point in own)))
     ends = np.cumsum([source.views.shape[1] for source in counted.sources])[:-1]
     of_sources = np.split(slopes @ np.vstack(of_fits), ends, axis=1)
     rows = [(s.name, loadings, s.degrees) for s, loadings in zip(counted.sources, of_sources, strict=True)]
@@ -355,7 +356,8 @@ def _refits(
     """(M, q) numbers of a feature from its points as M trials move them."""
     twists = np.sum([s.views @ drawn for s, drawn in modes], axis=0).T
     of_points = np.sum([s.shapes @ drawn for s, drawn in modes], axis=0).T
-    shapes, noise = places.point_shapes(fit.at)
+    shapes = places.point_shapes(fit.at)
+    noise = fit.noise[:, None] * fit.normal
     own = [(drawn, places.scan_shapes(fit.at, s.scan)) for s, drawn in modes if s.scan is not None]
     numbers = np.empty((trials, len(fit.values)))
     for start in range(0, trials, _TRIAL_BLOCK):

@@ -213,9 +213,8 @@ def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, list[tuple[s
     """Return twists (6V, K) that the overlaps show for unit smooth errors which all views share, by source what they
     are (K, m) as m independent ones of unit variance with degrees of freedom, and those that are new in each scan.
 
-    The overlaps show a part of the errors themselves: what counts is their second moment given that, f̂f̂ᵀ + C, since no
-    point is corrected by it. A size whose logarithm is known to s has e^(2s²) times the square of its likeliest value
-    as its mean square, and ½/s² degrees of freedom (JCGM 100, G.4.2).
+    The overlaps show a part of the errors themselves: what counts is their second moment given that, since no point is
+    corrected by it.
     """
     sums, noise = sum_smooth_errors(run.measurement, chain.unconstrained)
     twists = apparent_twists(sums, chain.unconstrained)
@@ -227,15 +226,12 @@ def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, list[tuple[s
     likelihood = view_error_likelihood(of_views, chain.unconstrained, noise)
     likelihood = replace(likelihood, design=(likelihood.design[SHARED][:, :COARSE], *likelihood.design[1:]))
     likeliest = likelihood.map_shares
-    spread = likelihood.share_spread(likeliest)
-    shares = likeliest * np.exp(spread**2)
     estimates = []
     shared = []
     for cause, name in enumerate((SCANNER, INCIDENCE)):
-        size = noise * shares[cause]
-        estimates.append(size * likelihood.estimate(cause, shares))
-        moment = np.outer(estimates[-1], estimates[-1]) + size**2 * likelihood.posterior_covariance(cause, shares)
-        shared.append((name, units[cause] @ np.linalg.cholesky(moment), float(0.5 / spread[cause] ** 2)))
+        mean, moment, degrees = likelihood.error_moments(cause, likeliest)
+        estimates.append(noise * mean)
+        shared.append((name, units[cause] @ (noise * np.linalg.cholesky(moment)), degrees))
     half = half_field(run.measurement)
     return twists, shared, fit_scan_errors(run.measurement, chain.unconstrained, noise, np.concatenate(estimates), half)
 

@@ -98,6 +98,17 @@ class FittedFeature:
         return float(high - low)
 
     @property
+    def noise(self) -> Array:
+        """(N,) by which each point may lie off along the normal of the surface: its residual, for want of k of them.
+
+        A scanner errs along the ray, so less across a surface at a slant: what a residual's square has on average is
+        the variance at that point, and sums over the points are those of it (White 1980, Econometrica 48:817; times
+        N/(N − k), MacKinnon and White 1985, J. Econometrics 29:305).
+        """
+        count = len(self.residual)
+        return self.residual * np.sqrt(count / (count - len(self.parameters)))
+
+    @property
     def gradient(self) -> Array:
         """(q, N, 3) of the values in the points."""
         return self.slopes[:, :, None] * self.normal

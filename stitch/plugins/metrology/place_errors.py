@@ -74,13 +74,12 @@ class PlaceErrors:
             np.concatenate(kept).astype(np.int64),
         )
 
-    def loadings(self, at: RunPoints, gradient: Array) -> tuple[Array, Array]:
+    def loadings(self, at: RunPoints, gradient: Array) -> Array:
         """Return what each mode of all sources, side by side, does to numbers (q, M) with these slopes (q, N, 3) in the
-        points, reference frame, and their covariance (q, q) by the noise of their own points."""
+        points, reference frame."""
         views = np.zeros((len(gradient), len(self.poses), 6))
         shapes = np.zeros((len(gradient), len(self.sources[0].shapes)))
         of_scans = dict[int | None, Array]()
-        noise = np.zeros((len(gradient), len(gradient)))
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
             g = gradient[:, of_view]
@@ -92,23 +91,17 @@ class PlaceErrors:
             if self.scan_errors is not None:
                 along_ray, modes = self.scan_modes(v, index)
                 of_scans[int(v)] = np.einsum("qni,ni->qn", g_scanner, along_ray) @ modes
-            scan = self.capture.scans[v]
-            along = scan.noise * np.einsum("qni,ni->qn", g_scanner, scan.normals[index])
-            noise += along @ along.T
         twists = views.reshape(len(gradient), -1)
-        every = [twists @ s.views + shapes @ s.shapes + of_scans.get(s.scan, 0.0) for s in self.sources]
-        return np.hstack(every), noise
+        return np.hstack([twists @ s.views + shapes @ s.shapes + of_scans.get(s.scan, 0.0) for s in self.sources])
 
-    def point_shapes(self, at: RunPoints) -> tuple[Array, Array]:
-        """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), and the noise of
-        each along its normal (N, 3), reference frame."""
+    def point_shapes(self, at: RunPoints) -> Array:
+        """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), reference
+        frame."""
         shapes = np.zeros((len(self.sources[0].shapes), len(at.points), 3))
-        noise = np.zeros_like(at.points)
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
             shapes[:, of_view] = frames.rotate(self.poses[v], self.point_modes(v, at.index[of_view]))
-            noise[of_view] = self.capture.scans[v].noise * at.normals[of_view]
-        return shapes, noise
+        return shapes
 
     def scan_shapes(self, at: RunPoints, v: int) -> Array:
         """Return by how much points move per mode of the smooth errors of scan v (M, N, 3), reference frame."""

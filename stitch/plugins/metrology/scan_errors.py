@@ -118,8 +118,9 @@ def scan_error_twists(
         moved = _cosines(away, m.normal, unconstrained.poses[view])[:, None] * errors.along(away)
         rows = frames.plane_rows(m.middle - g.centre, m.normal) * (m.weight * tukey(m.residual, g.scale))[:, None]
         pull = rows.T @ moved
-        pulls[m.v] += pull
-        pulls[m.w] -= pull
+        # The views move against what their points do, to where the surfaces meet again.
+        pulls[m.v] -= pull
+        pulls[m.w] += pull
     return solve_view_sums(g, pulls.reshape(6 * g.views, -1), np.zeros((6 * g.views, errors.count)))
 
 

@@ -31,6 +31,8 @@ from stitch.observations.surfaces.scanner_errors import (
     COARSE,
     PER_VIEW,
     SCALE_SIGMA,
+    SHARE_SPREAD,
+    USUAL_SHARE,
     SmoothErrorLikelihood,
     field_scatter,
     part_of_view,
@@ -261,6 +263,31 @@ def test_estimates_are_those_of_weighted_least_squares():
     wanted = np.linalg.solve(A.T @ W @ A + np.eye(6), A.T @ W @ shown.data)
     np.testing.assert_allclose(shown.estimate(0, shares), wanted[:4])
     np.testing.assert_allclose(shown.estimate(1, shares), wanted[4:])
+
+
+def test_moments_of_errors_of_unknown_size_are_those_of_weighed_draws():
+    rng = np.random.default_rng(4)
+    told = (rng.standard_normal((8, 2)), rng.standard_normal((8, 3)))
+    shown = SmoothErrorLikelihood(told[0] @ [0.9, -0.4] + rng.standard_normal(8), told, np.full(8, 1.5))
+    mean, moment, _ = shown.error_moments(0, np.array([9.0, 0.5]))
+    sizes = USUAL_SHARE * np.exp(SHARE_SPREAD * rng.standard_normal((400_000, 1)))
+    errors = sizes * rng.standard_normal((400_000, 2))
+    left = shown.data - errors @ told[0].T
+    beside = np.linalg.inv(np.diag(shown.scatter) + 0.25 * told[1] @ told[1].T)
+    weights = np.exp(-0.5 * np.einsum("ni,ij,nj->n", left, beside, left))
+    weights /= weights.sum()
+    np.testing.assert_allclose(mean, weights @ errors, rtol=0.03, atol=0.01)
+    np.testing.assert_allclose(moment, (errors.T * weights) @ errors, rtol=0.03, atol=0.01)
+
+
+def test_a_size_that_nothing_shows_counts_as_the_usual_ones_do():
+    nothing = SmoothErrorLikelihood(np.zeros(3), (np.zeros((3, 1)),), np.ones(3))
+    mean, moment, degrees = nothing.error_moments(0, np.ones(1))
+    square = np.exp(4 * SHARE_SPREAD**2)  # of a log-normal variance, over the square of its mean
+    assert mean == pytest.approx(0.0)
+    assert moment.item() == pytest.approx(USUAL_SHARE**2 * np.exp(2 * SHARE_SPREAD**2), rel=0.02)
+    # Sizes beyond four of their spread are left out: an eighth of its square.
+    assert degrees == pytest.approx(2 / (square - 1), rel=0.2)
 
 
 @pytest.mark.parametrize(
