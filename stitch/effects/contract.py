@@ -521,9 +521,9 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
 
 
 def stands_still(measurement: Measurement, effect: Effect) -> bool:
-    """Return True if an effect needs gravity to turn for scanner or part, whichever of the two stands still here.
+    """Return True if an effect needs gravity to turn for the one of scanner and part that stands still in this session.
 
-    What stands still in the cell does not turn against gravity.
+    That is the scanner with eye_to_hand, the part with eye_in_hand: gravity cannot turn for what stands still.
     """
     return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
 

@@ -133,12 +133,12 @@ def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
     def function(*arguments: Any, **parameters: Any) -> Any:
         """Call the effect with its arrays read-only, and return its result, checked."""
         # An effect must return a changed array and leave the one that it is given: writing raises an error.
-        views = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
-        for value in views:
+        read_only = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
+        for value in read_only:
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
         with _name_errors(path, f" effect {effect.name}:"):
-            result = effect.function(*views, **parameters)
+            result = effect.function(*read_only, **parameters)
         return _require_result(effect, arguments, result, f"{path}: effect {effect.name}")
 
     return function

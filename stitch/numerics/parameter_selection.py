@@ -37,7 +37,8 @@ _EVEN_ODDS = 0.5
 def log_evidence(information: Array, vector: Array, precision: Array | None = None, mean: Array | None = None) -> Array:
     """Return (...) log ∫ exp(vᵀθ − ½ θᵀIθ) p(θ) dθ, with a normal prior p of the amplitudes θ (k,).
 
-    It is the log Bayes factor of the amplitudes over θ = 0.
+    It is the log Bayes factor of the amplitudes over θ = 0: ½(qᵀ(I + P)⁻¹q − mᵀPm − log det(I + P) + log det P), with
+    the prior's precision P and mean m, and q = v + Pm.
 
     Args:
         information: (..., k, k) I of the log likelihood.
