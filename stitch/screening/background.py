@@ -42,15 +42,17 @@ _MOSTLY, _SEEN_TO_MOVE, _SELDOM = 0.5, 20, 0.25
 
 
 def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> tuple[tuple[int, ...], float] | None:
-    """Return the views that show something where others look through and see nothing, and the share of their points
-    that does so at least: where no other scan looks, nobody can say. None if it is too little.
+    """Return the views that show something where other scans look through, and the mean share of their points there.
+
+    None where no view has more than `_OCCLUDER_MIN_SHARE`. Of each view some points are tested: those that no other
+    scan shows, and behind which one measured a surface. The share is a lower bound: others do not look everywhere.
 
     Args:
-        poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
+        poses: (V, 4, 4) T_reference_scanner where the overlaps put the views.
         size: of the part, length_unit.
     """
     views = [v for v, scan in enumerate(scans) if len(scan.points)]
-    # Most scans are never asked.
+    # A tree is built only for scans that are needed: most are not.
     look_into = cache(lambda w: _ray_tree(scans[w]))
     shares = {}
     for v in views:
@@ -58,7 +60,7 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> tuple[tup
         points = scans[v].points[sample_points(scans[v], _OCCLUDER_PROBES)]
         seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
         apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
-        # Most are shown by the first scans that are asked; only the rest can be in the way.
+        # Points that no other scan shows: most drop out with the first scans.
         alone = points
         for w in asked:
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
@@ -85,10 +87,15 @@ def _evenly(views: Sequence[int], count: int) -> list[int]:
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
-    """Return which points (n, 3), frame of a scan, it looks past: all about their direction what it sees is farther.
+    """Return a mask (n,) of the points that a scan looks past: in every direction around their rays it saw farther.
 
-    One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
-    Where that face is too steep to be seen, there are looks on one side of the point alone.
+    Rays around are asked, not the nearest alone: beside an edge that one may pass a face that the scan sees aslant. If
+    the face is too steep to be seen, there are rays on one side of the point only (`_surrounded`).
+
+    Args:
+        look: tree over the directions of the scan's points.
+        points: (n, 3) frame of the scan.
+        behind: least distance from a point to what lies behind it, length_unit.
     """
     away = np.linalg.norm(points - scan.eye, axis=1)
     rays = scan.rays(points)
@@ -105,7 +112,12 @@ def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Ma
 
 
 def _surrounded(rays: Array, looks: Array) -> Mask:
-    """(n,) which unit vectors (n, 3) have some of others (n, k, 3) on every side: in each half of the directions."""
+    """Return a mask (n,) of rays with other rays on every side: no gap of half a turn or more around them.
+
+    Args:
+        rays: (n, 3) unit vectors.
+        looks: (n, k, 3) unit vectors near each.
+    """
     across = np.linalg.svd(rays[:, None, :])[2][:, 1:]  # (n, 2, 3) perpendicular to each
     off = np.einsum("nij,nkj->nki", across, looks - rays[:, None])
     angles = np.sort(np.arctan2(off[..., 1], off[..., 0]), axis=1)
@@ -116,15 +128,14 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
 ) -> tuple[float, tuple[int, ...], Array, Array | None] | None:
-    """Return what the scans show at one place before the scanner whatever the arm did; None if it is too little.
+    """Return what stands still before the scanner whatever the arm did; None if it is too little.
 
-    Its share of the points of all scans, the views that show it, its lowest and highest corner (2, 3) in the scanner's
-    frame, and the corners of a box with the part and without it, where one side of a box parts them.
+    Returned are its share of all points, the views that show it, its box (2, 3) (lowest and highest corner, scanner
+    frame), and a box (2, 3) with the part and without it, None where no axis-parallel plane separates them.
 
-    Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
-    view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
-    slides along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others
-    show it where it is, and nobody looks through it.
+    A point stands still if most views whose pose moves it show it at the same place before the scanner. A panel that
+    slides along itself, or a disc that turns about its axis, does so too; but under the model other views show it where
+    it is and none looks through it, so that it is no background.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner under the model.
@@ -157,7 +168,9 @@ def find_static_background(
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
-    """Return views before whose scanner the model has the points of view v far from where v saw them.
+    """Return some views whose scanners, by the model, have the points of view v far from where scanner v has them.
+
+    Only in these does a point at the same place before the scanner mean that it stands still.
 
     Args:
         points: (n, 3) of view v, scanner frame.
@@ -174,13 +187,13 @@ def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> li
 def _under_model(
     scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, probes: tuple[int, Indices], tolerance: float
 ) -> tuple[Mask, Mask]:
-    """Return which points (n,) of a view some other view shows where the model has them, and which one looks past.
+    """Return two masks (n,) of some points of a view: another view shows it at its place, another view looks past it.
 
     Args:
-        looks: by view a tree of the directions in which it sees.
+        looks: per view a tree over the directions of its points.
         poses: (V, 4, 4) T_reference_scanner by the model.
-        probes: the view, and the points of it that are asked.
-        tolerance: distance that is the same place, length_unit.
+        probes: the view, and the numbers (n,) of its points to test.
+        tolerance: distance along the normal that is the same place, length_unit.
     """
     v, index = probes
     on_part = np.zeros(len(index), bool)
@@ -197,9 +210,10 @@ def _under_model(
 
 
 def find_standing_scene(scans: Sequence[Scan]) -> tuple[float, Array] | None:
-    """Return the share of points that stand still before the scanner, and the corners (2, 3) of a box without them.
+    """Return the share of points that stand still before the scanner, and a box (2, 3), scanner frame, without them.
 
-    Nothing of poses is asked. None where less than half stands still, or no side of a box parts it from what moves.
+    It needs no poses: a point stands still if most other scans show it at the same place in their own frame. None where
+    less than half of the points do, or where no axis-parallel plane separates them from those that move.
     """
     probes = [scan.points[sample_points(scan, _BACKGROUND_PROBES)] for scan in scans]
     chosen = np.unique(np.linspace(0, len(scans) - 1, min(len(scans), _BACKGROUND_VIEWS)).round().astype(int))
@@ -216,7 +230,8 @@ def find_standing_scene(scans: Sequence[Scan]) -> tuple[float, Array] | None:
     still, moving = every[share >= _STANDS], every[share < _MOVES]
     if len(still) < _MOSTLY * len(every) or len(moving) < _SEEN_TO_MOVE:
         return None
-    # Of what stands still some is seen seldom: at the rim, and in the shadow of the part.
+    # Some of what stands still is seen seldom, at the rim and in the shadow of the part, and would count as moving:
+    # quantiles leave it out.
     part = np.clip(moving, *np.quantile(moving, (_SELDOM, 1 - _SELDOM), axis=0))
     other = np.clip(still, *np.quantile(still, (_SELDOM / 10, 1 - _SELDOM / 10), axis=0))
     size = float(np.linalg.norm(np.ptp(part, axis=0)))
@@ -229,12 +244,14 @@ def _bounding_box(points: Array) -> Array:
 
 
 def _box_beyond_part(part: Array, other: Array, every: Array, size: float) -> Array | None:
-    """Return the box (2, 3) of everything, cut off between the part and what else there is; None if no side parts them.
+    """Return a box (2, 3) of all points, cut by an axis-parallel plane between part and others; None if none fits.
+
+    The box is wider than all points by the size of the part, but for the side that is cut.
 
     Args:
-        part, other: (n, 3) points of either.
+        part, other: (n, 3) points of the part, and of what else there is.
         every: (2, 3) box of all points.
-        size: of the part, length_unit: by that the box is widened.
+        size: of the part, length_unit.
     """
     if not len(part):
         return None

@@ -43,12 +43,13 @@ class SurfaceFit:
 
 
 def hypotheses_by_surface(capture: Capture, ranked: Sequence[MotionFit]) -> tuple[SurfaceFit, ...]:
-    """Return the mistakes under which the views fall together clearly better than as stated, best first; () if none.
+    """Return the hypotheses about the poses under which surfaces agree clearly better than as stated, best first.
 
-    Those that cannot be told from the best stand behind it.
+    The first leaves less than 1/`CLEARLY_BETTER` of the misfit as stated, else the result is (). The others leave at
+    most `CLEARLY_BETTER` times the misfit of the first.
 
     Args:
-        ranked: hypotheses about the poses, the likeliest first (see `rank_hypotheses`).
+        ranked: hypotheses, the likeliest by the scans' motions first (`rank_hypotheses`); the first few are tried.
     """
     stated = next((fit for fit in ranked if fit.hypothesis.kind == "stated"), None)
     mistakes = [fit for fit in ranked if fit.hypothesis.kind != "stated"][:_HYPOTHESES_TRIED]
@@ -73,11 +74,13 @@ def hypotheses_by_surface(capture: Capture, ranked: Sequence[MotionFit]) -> tupl
 
 
 def surface_misfit(capture: Capture, hypothesis: Hypothesis, starts: Sequence[Array]) -> SurfaceFit:
-    """Return how well the views fall together under a hypothesis about the poses, by ICP from some hand-eyes (4, 4).
+    """Return the hand-eye under which the surfaces of all views agree best, given a hypothesis about the poses.
+
+    ICP from several hand-eyes; the best end counts. Where no views overlap the misfit is the largest, its truncation.
 
     Args:
-        capture: the scans; its own poses do not count.
-        starts: of which the one that ends best is kept.
+        capture: the scans; its poses are replaced by those of the hypothesis.
+        starts: hand-eyes T_mount (4, 4) to begin with.
     """
     posed = replace(capture, T_reference_mount=hypothesis.T_reference_mount)
     if hypothesis.used is not None:
@@ -102,9 +105,10 @@ def fit_centroids(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[f
 
 
 def _fit_batch(tried: Sequence[Hypothesis], centroids: Array) -> list[tuple[float, Array]]:
-    """Return per hypothesis the rms (length_unit) and the hand-eye (4, 4) that bring the centroids closest together.
+    """Return per hypothesis the rms (length_unit) of placed centroids about their mean, and the best hand-eye (4, 4).
 
-    Levenberg–Marquardt of all hypotheses from all starts at once; a step that makes it worse is not taken.
+    Levenberg–Marquardt in `_CENTROID_STEPS` steps of all hypotheses from `_STARTS` rotations at once; a step that
+    raises the cost is not taken.
 
     Args:
         centroids: (V, 3) of the scans, scanner frame.
@@ -151,7 +155,14 @@ def _mean_square(residual: Array, share: Array) -> Array:
 
 
 def _best_translation(poses: Array, X: Array, centroids: Array, share: Array) -> Array:
-    """Return shifts (P, 3) of the hand-eyes X that bring the centroids closest together while the rotations stay."""
+    """Return translations (P, 3) to add to hand-eyes X that bring the centroids closest together; rotations stay.
+
+    Args:
+        poses: (P, V, 4, 4) of the mount.
+        X: (P, 4, 4) hand-eyes.
+        centroids: (V, 3) of the scans, scanner frame.
+        share: (P, V) weights of the views, of sum 1.
+    """
     R = poses[..., :3, :3]
     M = R - np.einsum("pv,pvij->pij", share, R)[:, None]
     _, r = _placed(poses, X, centroids, share)

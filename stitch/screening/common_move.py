@@ -30,7 +30,11 @@ _STEPS = 12
 
 
 def find_common_move(capture: Capture) -> "CommonMove | None":
-    """Return the move that the evidence is for; None where there is none or too few views could show it."""
+    """Return the view from which on all labelled points stand elsewhere, and by which motion; None if none is proven.
+
+    Two models are fitted: one hand-eye for all views, and the same with a rigid motion of the base from some view on.
+    The second has to lower −2 log likelihood by more than its price (BIC), which counts the choice of the view too.
+    """
     s = capture.sightings
     assert s is not None
     capture = replace(capture, sightings=_thinned(s))
@@ -40,6 +44,7 @@ def find_common_move(capture: Capture) -> "CommonMove | None":
     fits = [CommonMove(capture, T_mount) for T_mount in _starts(capture)]
     if not fits:
         return None
+    # A move that begins after the last view is none.
     one = min((fit.solved([count]) for fit in fits), key=lambda fit: fit.total)
     starts = list(range(_SIDE_VIEWS, count - _SIDE_VIEWS + 1))
     two = max((fit.solved(starts) for fit in [*fits, one]), key=lambda fit: one.evidence_of(fit))
@@ -55,7 +60,10 @@ def _thinned(s: Sightings) -> Sightings:
 
 
 def _starts(capture: Capture) -> Iterator[Array]:
-    """Yield hand-eyes (4, 4) of all views, of the first and of the last third: one side at least holds together."""
+    """Yield hand-eyes (4, 4) in closed form from all views, from the first third and from the last third.
+
+    If the base moved, one of these thirds lies on one side of it. One that shows no hand-eye is left out.
+    """
     count = len(capture.T_reference_mount)
     third = max(count // 3, _SIDE_VIEWS)
     for left_out in (np.arange(0), np.arange(third, count), np.arange(count - third)):
@@ -66,7 +74,10 @@ def _starts(capture: Capture) -> Iterator[Array]:
 
 
 def _placed(capture: Capture, T_mount: Array, T: Array, s: Sightings) -> tuple[Array, Array]:
-    """Return points (V, S, 3) in the base's frame and in the reference frame, with the base moved by T (…, 4, 4)."""
+    """Return labelled points (V, S, 3) in the base's and in the reference frame, with the base moved by T (…, 4, 4).
+
+    With the sensor in hand both are the same; with a fixed sensor, the reference frame is the flange's.
+    """
     if capture.scanner_rides:
         in_base = frames.transform(T @ capture.poses(T_mount), s.points)
         return in_base, in_base
@@ -78,7 +89,10 @@ class CommonMove:
     """Hand-eye, targets, and a move of the base from a view on, by least squares."""
 
     def __init__(self, capture: Capture, T_mount: Array, T: Array | None = None, start: int | None = None) -> None:
-        """Place all labelled points, those from view `start` on as if the arm's base had moved by T (4, 4)."""
+        """Place all labelled points, those from view `start` on with the base moved by T (4, 4).
+
+        `rest` (N, 3), length_unit, is what each point is off the mean of its target. None: no motion, no view.
+        """
         self.capture, self.T_mount = capture, T_mount
         self.T = np.eye(4) if T is None else T
         self.start = len(capture.T_reference_mount) if start is None else start
@@ -109,7 +123,7 @@ class CommonMove:
         return self.moved > _SURE_TIMES * np.sqrt(self.total / len(self.rest))
 
     def shows(self, capture: Capture) -> Mask:
-        """Return which views of another capture stand on the moved side."""
+        """Return a mask of the views of another capture whose points fit the targets better with the base moved."""
         s = capture.sightings
         assert s is not None
         middles = np.full((len(s.targets), 3), np.nan)
@@ -122,19 +136,26 @@ class CommonMove:
         return apart[1] < apart[0]
 
     def solved(self, starts: list[int]) -> "CommonMove":
-        """Return the best of the moves from any of the views, improved until nothing changes."""
+        """Return the move with the least sum of squares among those that begin at one of `starts`, views.
+
+        Each step takes one Gauss–Newton step from every start and keeps the best. It ends, at the latest after
+        `_STEPS`, when neither the view nor the sum changes.
+        """
         best = self
         for _ in range(_STEPS):
             tried = [CommonMove(self.capture, best.T_mount, best.T, start)._stepped() for start in starts]
             nearer = min(tried, key=lambda fit: fit.total)
             if nearer.start == best.start and nearer.total > (1 - 1e-6) * best.total:
                 break
-            # Of two views with one move the likelier comes first; then only it and its neighbours are looked at.
+            # From the second step on, only the best view and its neighbours are tried.
             best, starts = nearer, [k for k in starts if abs(k - nearer.start) <= 2]
         return best
 
     def _stepped(self) -> "CommonMove":
-        """Return the move after one Gauss–Newton step of hand-eye and base: 12 unknowns, turns about middles."""
+        """Return the move after one Gauss–Newton step of 12 unknowns: twist of the hand-eye, then twist of the base.
+
+        Rotations are about the centroid of the points, sensor and base frame, so that they are well conditioned.
+        """
         p = self.sightings.points[self.view, self.slot]
         centroid = p.mean(axis=0)
         base_centroid = self.in_base.mean(axis=0)
@@ -167,7 +188,10 @@ class CommonMove:
         return rows - (sums / count[:, None, None])[self.target]
 
     def _view_squares(self) -> tuple[Array, Array, Array]:
-        """Return means (V, 3) of views, and squares (3, 3) of these and of what is left about them."""
+        """Return the mean residual (V, 3) of each view, the squares (3, 3) of the means, and those of what is left.
+
+        What is left are residuals about their view's mean, each over the number of points in the view.
+        """
         count = np.bincount(self.view, minlength=len(self.sightings.points))
         means = np.zeros((len(count), 3))
         np.add.at(means, self.view, self.rest)
@@ -176,7 +200,11 @@ class CommonMove:
         return means, means.T @ means, (left / count[self.view, None]).T @ left
 
     def evidence_of(self, other: "CommonMove") -> float:
-        """Return by how much −2 log likelihood falls from this fit to another one."""
+        """Return by how much −2 log likelihood falls from this fit to another one.
+
+        It is n·d·log of the ratio of squares, for the means of the views and for residuals about them. n counts
+        independent views: neighbours with like errors count as fewer. d counts the directions in which errors scatter.
+        """
         means, *squares = other._view_squares()
         own = self._view_squares()[1:]
         following = float(np.sum(means[1:] * means[:-1])) / max(float(np.sum(means**2)), 1e-300)

@@ -57,10 +57,14 @@ _LAGS, _LAG_OFF = np.linspace(0.02, 0.6, 30), 4.0
 
 
 def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices | None = None) -> list[MotionFit]:
-    """Return all hypotheses about the poses of a session, best first; empty if the scans show too little motion.
+    """Return hypotheses about the poses of a session with their best hand-eyes, best first; [] with too few motions.
+
+    The poses as stated are always among them. Others are only tried where those explain less than `_ALL` of the
+    motions. A free scale of the robot's lengths is tried too, and dropped where a mistake explains clearly more.
 
     Args:
-        rows: of the session between which the motions are, by their index among these; None: all.
+        motions: of the scanner between pairs of views, from the scans alone.
+        rows: views of the session that the motions number; None: all.
     """
     if len(motions.pairs) < FEWEST:
         return []
@@ -78,7 +82,7 @@ def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices 
         tried += [*_between_rows(stated, motions, length), *lagging_poses(stated, motions)]
         tried += _by_table_part(tried, motions, [session.names[v] for v in every])
         fits += fit_hypotheses(tried, motions, session.length_unit)[1:]
-    # A scale that leaves nothing of the positions closes as well as what explains them.
+    # A scale near zero removes the positions, and then explains as many motions as a reading that explains them.
     if scaled.hypothesis.kind != "scale" or scaled.closed * _AS_MANY > max(fit.closed for fit in fits):
         fits.append(scaled)
     return sorted(fits, key=lambda fit: (fit.open, fit.hypothesis.kind != "stated"))
@@ -87,10 +91,12 @@ def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices 
 def fit_hypotheses(
     tried: Sequence[Hypothesis], motions: RelativeScans, length_unit: str, *, scaled: bool = False
 ) -> list[MotionFit]:
-    """Fit hypotheses that could close, the first always, in their order; those that move alike are one.
+    """Return the best hand-eye per hypothesis, in their order, without those that cannot explain the motions.
+
+    The first is always kept; of hypotheses with the same relative motions, the first one. [] with too few motions.
 
     Args:
-        scaled: fit the scale of the robot's lengths too.
+        scaled: fit a factor on the robot's lengths too.
     """
     if len(motions.pairs) < FEWEST:
         return []
@@ -100,10 +106,10 @@ def fit_hypotheses(
 
 
 def equivalent_hypotheses(fits: Sequence[MotionFit]) -> list[MotionFit]:
-    """Return the hypotheses that these motions cannot tell from the best, best first; empty if none explains them.
+    """Return the hypotheses that explain the motions about as well as the best, best first; [] if that explains few.
 
-    `open` of a fit is the mean truncated square, 0 to 1, of what its motions leave: one that leaves no more than
-    1/_CLEARER of the best, and a floor for rounding, is no clearer than that.
+    `open` of a fit is the mean truncated square, 0 to 1, of what its motions leave. About as well: at most 1/`_CLEARER`
+    of the best one's, plus `_CLEAR_OPEN` for rounding.
     """
     ranked = sorted(fits, key=lambda fit: fit.open)
     if not ranked or ranked[0].closed < _MIN_CLOSED_SHARE:
@@ -112,7 +118,14 @@ def equivalent_hypotheses(fits: Sequence[MotionFit]) -> list[MotionFit]:
 
 
 def proven_hypotheses(ranked: Sequence[MotionFit]) -> tuple[MotionFit, ...]:
-    """Return the hypotheses that explain the motions as well as any, if the poses as stated do not; () if they do."""
+    """Return the hypotheses that explain the motions where the poses as stated do not: proof of a mistake; else ().
+
+    Proof: the best closes `_MIN_CLOSED_SHARE` of the motions and leaves less than `_CLEARER` of what the stated one
+    leaves. Those that explain nearly as much follow it.
+
+    Args:
+        ranked: best first, as `rank_hypotheses` returns them.
+    """
     if not ranked:
         return ()
     best = ranked[0]
@@ -124,10 +137,13 @@ def proven_hypotheses(ranked: Sequence[MotionFit]) -> tuple[MotionFit, ...]:
 
 
 def likeliest_hypotheses(ranked: Sequence[MotionFit]) -> tuple[MotionFit, ...]:
-    """Return the readings that agree with many motions where the stated one agrees with hardly any; () if none does.
+    """Return the hypotheses that close many motions where the stated poses close hardly any, best first; else ().
 
-    Less than `proven_hypotheses` asks for: a part that slides on itself closes half of the motions under any reading.
-    So it is for sessions of which views are accused anyway.
+    It is weaker than `proven_hypotheses`, since a part that slides on itself closes half of the motions under any
+    hypothesis. So it is asked only for sessions whose poses are known to contradict the scans.
+
+    Args:
+        ranked: as `rank_hypotheses` returns them.
     """
     if not ranked:
         return ()
@@ -139,7 +155,10 @@ def likeliest_hypotheses(ranked: Sequence[MotionFit]) -> tuple[MotionFit, ...]:
 
 
 def _in_another_unit(fit: MotionFit) -> MotionFit:
-    """Return the stated poses with another unit of length, or another scale."""
+    """Return a fit of the stated poses with free scale as a hypothesis: another unit, or a factor that is none.
+
+    A scale that is not positive explains nothing.
+    """
     if fit.scale <= 0:
         return replace(fit, open=1.0, closed=0.0)
     factor = known_unit_ratio(fit.scale)
@@ -150,7 +169,10 @@ def _in_another_unit(fit: MotionFit) -> MotionFit:
 
 
 def _accused_views(stated: MotionFit, motions: RelativeScans, length: float) -> list[int]:
-    """Return the views of which the largest share of motions stays open under the poses as stated."""
+    """Return the `MOST_EXCHANGED` views, sorted, with the largest share of motions that stay open as stated.
+
+    A motion is open if rotation or translation differ by more than `ROTATION` (rad) or `length` (length_unit).
+    """
     T = stated.hypothesis.T_reference_mount
     v, w = np.array(motions.pairs).T
     off = frames.inverse(stated.T_mount) @ frames.inverse(T[v]) @ T[w] @ stated.T_mount @ frames.inverse(motions.T)
@@ -162,9 +184,12 @@ def _accused_views(stated: MotionFit, motions: RelativeScans, length: float) -> 
 
 
 def _with_stuck_columns_restored(stated: MotionFit, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
-    """Yield the poses in which a column that holds one value has those that the motions ask for, if most rows differ.
+    """Yield the poses with a column of positions that has one value in all rows replaced by what the motions ask for.
+
+    Only if most of these values differ from their median by more than `length`.
 
     Args:
+        stated: fit of the poses as stated.
         length: what a motion may leave open, length_unit.
     """
     h = stated.hypothesis
@@ -185,9 +210,14 @@ def _with_stuck_columns_restored(stated: MotionFit, motions: RelativeScans, leng
 def _on_linear_axis(
     session: SessionData, rows: Indices, stated: MotionFit, motions: RelativeScans
 ) -> Iterator[Hypothesis]:
-    """Yield the poses with a column beside them added along the direction that the motions ask for: a rail, a lift.
+    """Yield the poses moved by a covariate of views.csv along one direction, as if it were a rail or lift of the robot.
 
-    A direction of another length than the column's unit allows is none.
+    The direction is the one that explains the motions best. Its length must be a ratio of length units (1, 1000 or
+    0.001); near an axis of the base it is that axis.
+
+    Args:
+        rows: views of the session that the motions number.
+        stated: fit of the poses as stated.
     """
     h = stated.hypothesis
     T = h.T_base_flange
@@ -218,11 +248,11 @@ def _on_linear_axis(
 
 
 def _between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
-    """Yield the poses between which those stated are midway: each between its own row's and the next or previous one's.
+    """Yield the poses at the scans, if each pose stated lies midway between those of its scan and of a neighbour's.
 
-    A motion between scans is halved as a screw, and so the motions between poses that were stated follow from it; the
-    hand-eye under which they do puts every pose back by half a motion. Programs that interpolate turn evenly and move
-    the flange along a line: then its positions are found from the motions, since one of them tells all others.
+    Two ways of interpolation are undone. As screws: the scanner's motions are halved, the hand-eye that explains the
+    stated poses by these is fitted, and each pose is moved back by half a motion. Along lines: rotations as before,
+    positions found from the motions.
 
     Args:
         length: what a motion may leave open, length_unit.
@@ -250,9 +280,10 @@ def _between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> 
 
 
 def lagging_poses(stated: Hypothesis, motions: RelativeScans) -> Iterator[Hypothesis]:
-    """Yield the poses of which those stated lag by one share of each step, along screws and along lines.
+    """Yield the poses at the scans, if each pose stated lags by the same share of the way from the pose before.
 
-    The share is the one under which the flange turns by the scanner's angles.
+    The share is the one under which the flange turns by the same angles as the scanner, by two grids. Interpolation
+    along screws and along lines are both undone.
     """
     T = stated.T_base_flange
     v, w = np.array(motions.pairs).T
@@ -270,7 +301,13 @@ def lagging_poses(stated: Hypothesis, motions: RelativeScans) -> Iterator[Hypoth
 
 
 def _without_lag(T: Array, shares: Array, along_lines: bool) -> Array:
-    """Return (S, V, 4, 4): each pose as far ahead of that stated as this lags, for S shares."""
+    """Return the poses (S, V, 4, 4) from which those stated lag by S shares of each step from the pose before.
+
+    Args:
+        T: (V, 4, 4) T_base_flange as stated.
+        shares: (S,) from 0 (no lag) to 1.
+        along_lines: positions were interpolated along lines; else with the rotation, along screws.
+    """
     out = [np.tile(T[0], (len(shares), 1, 1))]
     for pose in T[1:]:
         last = out[-1]
@@ -282,7 +319,12 @@ def _without_lag(T: Array, shares: Array, along_lines: bool) -> Array:
 
 
 def _positions_of_middles(middle: Array, ahead: int) -> tuple[Array, Array]:
-    """Return p (V, 3) and Q (V, 3, 3): positions p + Q·u of which those stated are the middles, whatever u is."""
+    """Return p (V, 3) and Q (V, 3, 3) such that the positions p + Q·u have the given middles, for any u (3,).
+
+    Args:
+        middle: (V, 3) positions as stated, each midway between its own and a neighbour's.
+        ahead: 1: the neighbour is the next row; −1: the previous one.
+    """
     p = np.zeros((len(middle), 3))
     Q = np.tile(np.eye(3), (len(middle), 1, 1))
     for v in range(1, len(middle)):
@@ -292,7 +334,10 @@ def _positions_of_middles(middle: Array, ahead: int) -> tuple[Array, Array]:
 
 
 def _by_table_part(tried: Sequence[Hypothesis], motions: RelativeScans, names: Sequence[str]) -> Iterator[Hypothesis]:
-    """Yield the stated poses, up to some row or from it on with a mistake undone that turns them.
+    """Yield the stated poses with a mistake of rotations undone only in a part of the table: its beginning or its end.
+
+    For each mistake, the parts under which most motions turn by the scanner's angle, if that is more than all rows or
+    none.
 
     Args:
         tried: hypotheses, the first of which is the poses as stated.
@@ -316,7 +361,7 @@ def _by_table_part(tried: Sequence[Hypothesis], motions: RelativeScans, names: S
         agree = [near[side[v].astype(int), side[w].astype(int), np.arange(len(v))].mean() for side in sides]
         if max(agree) <= max(near[0, 0].mean(), near[1, 1].mean()):
             continue
-        # Both sides of one row may turn alike under a reading, and only the hand-eye tells which was read so.
+        # Several parts may agree with as many angles: which one is right only the hand-eye shows, later.
         for side in (side for side, share in zip(sides, agree, strict=True) if share == max(agree)):
             rows = tuple(int(row) for row in np.flatnonzero(side))
             T = np.where(side[:, None, None], h.T_base_flange, stated.T_base_flange)

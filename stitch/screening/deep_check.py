@@ -70,10 +70,11 @@ def deep_check(session: SessionData) -> list[SessionProblem]:
 
 
 def _check_clouds(session: SessionData) -> list[SessionProblem]:
-    """Return the problems of a session of scans: by the scanner's own motions, by its views, and by other readings.
+    """Return the problems of a session of scans.
 
-    A mistake that the motions prove is the answer alone: it makes all views look wrong. Else views are asked under the
-    poses as stated; another reading is only tried where that leads nowhere.
+    In this order: a mistake of all poses that the scanner's motions prove is the only answer, since it makes all views
+    look wrong. Else the views are tested under the poses as stated. A likely mistake of all poses is looked for where
+    these contradict the scans, or where another hypothesis explains twice as many motions.
     """
     session, capture = thin_session(session, _POINTS)
     capture = replace(capture, sightings=drop_mislabelled(capture.sightings))
@@ -88,7 +89,7 @@ def _check_clouds(session: SessionData) -> list[SessionProblem]:
         if undone is None:
             raise
         return [undone]
-    # The scanner's motions may agree with poses that were read otherwise, and with those as stated hardly.
+    # Another hypothesis may explain at least twice as many motions as the poses as stated.
     stated = max((fit.closed for fit in ranked if fit.hypothesis.kind == "stated"), default=1.0)
     rivalled = bool(ranked) and stated < _CLOSES * ranked[0].closed
     if not contradicted and not (problems and rivalled):
@@ -102,7 +103,14 @@ def _check_clouds(session: SessionData) -> list[SessionProblem]:
 def _check_views(
     session: SessionData, capture: Capture, ranked: Sequence[MotionFit]
 ) -> tuple[list[SessionProblem], bool]:
-    """Return problems of single views under the stated poses, and True if these contradict the scans altogether."""
+    """Return the problems of views under the stated poses, and whether these poses contradict the scans altogether.
+
+    Scans are cleared of stock first, one view after the other. A factor on the robot's lengths is the only answer; so
+    is, with the views' problems, a table that rounds its numbers.
+
+    Args:
+        ranked: hypotheses about the poses, for a hand-eye to begin with.
+    """
     T_mount, snooping = _snoop_from_start(session, capture, *_starting_hand_eye(session, capture, ranked))
     while stock := find_stock(session, capture, T_mount, snooping):
         capture = capture.without_stock(stock)
@@ -128,7 +136,10 @@ def _check_views(
 
 
 def _starting_hand_eye(session: SessionData, capture: Capture, ranked: Sequence[MotionFit]) -> tuple[Array, float]:
-    """Return a hand-eye that these poses allow, and the distance between partners to begin with."""
+    """Return a hand-eye (4, 4) to begin with, and the largest distance between corresponding points, length_unit.
+
+    From the scans' motions if these agree with the poses, else stated in session.toml, else searched.
+    """
     stated = next((fit for fit in ranked if fit.hypothesis.kind == "stated" and fit.scale == 1.0), None)
     size = part_size([capture])
     if stated is not None and stated.closed >= _CLOSES:
@@ -140,7 +151,11 @@ def _starting_hand_eye(session: SessionData, capture: Capture, ranked: Sequence[
 
 
 def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, gate: float) -> tuple[Array, Snooping]:
-    """Return the hand-eye refined from a start, and what snooping finds under it."""
+    """Return the hand-eye (4, 4) refined from a start by ICP, and what the tests of the views find under it.
+
+    Args:
+        gate: largest distance between corresponding points at first, length_unit.
+    """
     T_mount, overlaps, _ = icp_hand_eye([capture], T_mount, [gate])
     require_near_scanner([capture], T_mount)
     gate = overlaps[0].gate
@@ -151,8 +166,11 @@ def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, ga
 
 
 def _likely_mistake(session: SessionData, capture: Capture, ranked: Sequence[MotionFit]) -> SessionProblem | None:
-    """Return the mistake that, undone, lets the surfaces agree without contradiction; else the one that the motions
-    show short of proof; None if there is neither."""
+    """Return a likely mistake of all poses as a problem; None if there is none.
+
+    First choice: one that, undone, lets the surfaces of all views agree. Second: one that the motions suggest, short of
+    proof (`likeliest_hypotheses`).
+    """
     by_surface = hypotheses_by_surface(capture, ranked)
     if by_surface and _surfaces_agree(session, capture, by_surface[0]):
         return _convention_problem(session, by_surface)
@@ -161,7 +179,7 @@ def _likely_mistake(session: SessionData, capture: Capture, ranked: Sequence[Mot
 
 
 def _surfaces_agree(session: SessionData, capture: Capture, fit: SurfaceFit) -> bool:
-    """Return True if nothing contradicts the poses any more once a mistake is undone."""
+    """Return whether the poses of a hypothesis, tested as a session of their own, do not contradict the scans."""
     h = fit.hypothesis
     used = range(len(session.views)) if h.used is None else h.used
     views = tuple(replace(session.views[v], T_base_flange=h.T_base_flange[v], joints=None) for v in used)
@@ -175,7 +193,7 @@ def _surfaces_agree(session: SessionData, capture: Capture, fit: SurfaceFit) -> 
 
 
 def _convention_problem(session: SessionData, fits: Sequence[MotionFit | SurfaceFit]) -> SessionProblem:
-    """Return one problem from hypotheses that are as likely, the best first."""
+    """Return one problem of a session from hypotheses that are about equally likely, the best first: it names all."""
     best = fits[0].hypothesis
     fixes = [fit.hypothesis.fix for fit in fits]
     if best.kind == "unit" and isinstance(fits[0], MotionFit):
@@ -184,7 +202,11 @@ def _convention_problem(session: SessionData, fits: Sequence[MotionFit | Surface
 
 
 def _depth_scale_fix(session: SessionData, scale: float) -> list[str]:
-    """Return what to write beside depth images whose counts are of another length; nothing for other clouds."""
+    """Return the fix of a wrong unit where the clouds are depth images: the depth_scale to write; [] for other clouds.
+
+    Args:
+        scale: fitted factor on the robot's lengths against the scans'.
+    """
     factor = known_unit_ratio(scale)
     table = session.path / "views.csv"
     if factor is None or not table.is_file():
@@ -200,17 +222,19 @@ def _depth_scale_fix(session: SessionData, scale: float) -> list[str]:
 
 
 def refuse(session: SessionData, problems: Sequence[SessionProblem]) -> None:
-    """Raise what a deep check found; do nothing where it found nothing certain."""
+    """Raise the first problem of a deep check that is certain; do nothing where none is.
+
+    Raises:
+        NoResultError: it is of a kind that says that something is wrong, not what (`KINDS_WITHOUT_A_CAUSE`).
+        InputError: it is of any other kind.
+    """
     for certain in (p for p in problems if p.certain):
         error = NoResultError if certain.kind in KINDS_WITHOUT_A_CAUSE else InputError
         raise error(f"{session.path}: the poses contradict what was measured: {certain.line(session.names)}")
 
 
 def refuse_whole(session: SessionData) -> list[SessionProblem]:
-    """Refuse a mistake of the whole session, such as a wrong order of angles.
-
-    Returns:
-        What else a deep check found.
+    """Return what a deep check finds, unless it finds a mistake of the whole session, as a wrong order of angles.
 
     Raises:
         InputError: there is one.

@@ -89,12 +89,14 @@ def weigh_few_views(
 
 
 def _evidence(z: Array, A: Array, fixed: Array, arm: Array, scatter: Array) -> tuple[float, float]:
-    """Return the log restricted likelihood of z (n,) over all sizes, and the least χ² of z at sizes of ordinary arms.
+    """Return the log restricted likelihood of z (n,), summed over sizes of the errors, and the least χ² among these.
+
+    z = A ξ + e with cov e = fixed + a²·arm + s²·scatter, for a and s on a grid, weighted by log-normal priors.
 
     Args:
-        A: (n, r) of a free hand-eye.
+        A: (n, r) columns of the free hand-eye.
         fixed: (n, n) covariance that is known.
-        arm, scatter: (n, n) what the arm adds at a usual size, and what scatter does.
+        arm, scatter: (n, n) covariances that errors of the arm, and white scatter, add at their usual size.
     """
     logs = list[float]()
     squares = list[float]()

@@ -28,12 +28,15 @@ _SEEN = 1e-9
 def hand_eye_sigma_anywhere(
     measurement: Measurement, model: Model, unconstrained: UnconstrainedPoses, scatter: Repeatability
 ) -> Array | None:
-    """Return sigma (6,) of ξ in T·exp(ξ), rad and length_unit; None of very many views.
+    """Return sigma (6,) of the hand-eye's ξ, T_mount·exp(ξ), rad and length_unit, with effects that nobody added.
+
+    To the model's covariance is added G J (1 + JᵀPJ)⁻¹ Jᵀ Gᵀ: what effects of mount, part and scanner may still do
+    after the views were seen (symbols at the head of this file). None for more than `_MOST_VIEWS` views.
 
     Args:
-        model: with the covariance of its hand-eye; its effects are counted there.
+        model: with the covariance of its hand-eye; effects in use are in that already.
         unconstrained: the views moved by their overlaps alone.
-        scatter: of the flange poses, as the overlaps show it.
+        scatter: of the flange's poses, as the overlaps show it.
     """
     capture = measurement.capture
     if len(unconstrained.poses) > _MOST_VIEWS:

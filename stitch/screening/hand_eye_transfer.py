@@ -28,12 +28,12 @@ _EFFECTS = "effects of the model"
 def hand_eye_transfer(
     measurement: Measurement, capture: Capture, unconstrained: UnconstrainedPoses, model: Model
 ) -> HandEyeTransfer:
-    """Return how a model's hand-eye compares with the one that the views of a session show.
+    """Return how a given hand-eye differs from the one that a session's views show, with a χ² test and U of both.
 
     Args:
-        capture: the session's, without the model's effects.
-        unconstrained: its views moved by their overlaps alone, from the poses under the model.
-        model: with the covariance of its hand-eye and effects.
+        capture: the session's, with the model's effects taken out.
+        unconstrained: its views moved by their overlaps alone, and the twists from the model's poses there.
+        model: the given hand-eye and effects, with their covariances.
     """
     T_mount = fit_hand_eye([capture], [unconstrained], model.T_mount).T_mount
     # Views that start far off have not converged, which would count as scatter: once more from there.

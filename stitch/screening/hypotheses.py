@@ -259,7 +259,7 @@ class Hypothesis:
         return frames.inverse(self.T_base_flange) if self.mount == "eye_to_hand" else self.T_base_flange
 
     def undone(self, mistake: str, T_base_flange: Array, **words: Any) -> "Hypothesis":
-        """Return other poses (V, 4, 4) of the same mount, as they are after a mistake of the list is undone."""
+        """Return the hypothesis that a mistake of `MISTAKES` was made; T_base_flange (V, 4, 4) are poses without it."""
         return replace(self, kind=_KINDS[mistake], T_base_flange=T_base_flange, fix=sentence(mistake, **words))
 
 
@@ -272,11 +272,11 @@ def stated_hypothesis(session: SessionData, rows: Indices | None = None) -> Hypo
 def hypotheses(
     session: SessionData, rows: Indices | None = None, exchangeable: Sequence[int] | None = None
 ) -> list[Hypothesis]:
-    """Return the poses as stated, first, and with every mistake undone that can be undone.
+    """Return the poses as stated, first, and then with every single mistake undone that these poses could have.
 
     Args:
-        rows: of the session that are tried; None: all.
-        exchangeable: of these, views that may have changed places, by their index among them; None: of few views all.
+        rows: numbers of the views that are tried; None: all.
+        exchangeable: positions among `rows` of views that may have changed places; None: all, if they are few.
     """
     every = np.arange(len(session.views)) if rows is None else rows
     stated = stated_hypothesis(session, every)
@@ -290,7 +290,10 @@ def hypotheses(
 
 
 def _joint_mistakes(session: SessionData, stated: Hypothesis, rows: Indices) -> Iterator[Hypothesis]:
-    """Yield mistakes with joint angles, and with the mount, which they tell from inverted poses."""
+    """Yield the poses without a mistake of joint angles or of the mount.
+
+    Without joints, another mount looks like inverted poses: then one hypothesis stands for both.
+    """
     robot = session.robot
     T = stated.T_base_flange
     other_mount = _OTHER_MOUNT[session.mount]
@@ -308,7 +311,10 @@ def _joint_mistakes(session: SessionData, stated: Hypothesis, rows: Indices) -> 
 
 
 def _joint_changes(count: int) -> Iterator[tuple[str, Array, dict[str, str]]]:
-    """Yield mistake, matrix on the angles and words of joints that count otherwise than the robot's description."""
+    """Yield the name of a mistake, the matrix (n, n) that undoes it on the joint angles, and the words of its sentence.
+
+    Mistakes: signs of one or two joints, one joint in radians, joint 3 coupled to joint 2.
+    """
     names = [f"j{j + 1}" for j in range(count)]
     for turned in (*combinations(range(count), 1), *combinations(range(count), 2)):
         signs = np.diag([-1.0 if j in turned else 1.0 for j in range(count)])
@@ -326,7 +332,7 @@ def _joint_changes(count: int) -> Iterator[tuple[str, Array, dict[str, str]]]:
 
 
 def _pose_mistakes(stated: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield mistakes that change all poses in the same way."""
+    """Yield the poses without a mistake that changes all of them alike: rotations, handedness, positions, frame."""
     T = stated.T_base_flange
     position = T[:, :3, 3]
     for mistake, turned, words in _other_rotations(Rotation.from_matrix(T[:, :3, :3])):
@@ -339,7 +345,10 @@ def _pose_mistakes(stated: Hypothesis) -> Iterator[Hypothesis]:
 
 
 def _other_rotations(R: Rotation) -> Iterator[tuple[str, Rotation, dict[str, str]]]:
-    """Yield mistake, rotations and words: quaternions and angles (V) taken for something else."""
+    """Yield the name of a mistake, the V rotations without it, and the words of its sentence.
+
+    Quaternions with another sign or order, Euler angles of another order, radians read as degrees.
+    """
     q = R.as_quat()
     yield "other way", R.inv(), {}
     yield "w first", Rotation.from_quat(q[:, [1, 2, 3, 0]]), {}
@@ -352,7 +361,11 @@ def _other_rotations(R: Rotation) -> Iterator[tuple[str, Rotation, dict[str, str
 
 
 def _other_orders(R: Rotation) -> Iterator[tuple[str, Rotation, dict[str, str]]]:
-    """Yield angles that were composed in one order and belong into another, columns by place or by axis."""
+    """Yield the name of a mistake, the V rotations without it, and words: Euler angles read in a wrong order.
+
+    Columns may belong to places in the order, or to axes by name. Rotation vectors read as angles, and the other way
+    round, are tried too.
+    """
     for order in BOTH_ORDERS:
         angles = euler_angles(R, order)
         for right in BOTH_ORDERS:
@@ -392,9 +405,9 @@ def _shortest(angles: Array) -> Array:
 
 
 def _other_positions(position: Array) -> Iterator[tuple[str, Array, dict[str, str]]]:
-    """Yield mistake, positions (V, 3) and words: permuted columns, one or two wrong signs, one column in another unit.
+    """Yield the name of a mistake, the positions (V, 3) without it, and words: columns, signs, or a column's unit.
 
-    All three with the other sign are a left-handed frame, of poses or of scans.
+    One or two wrong signs: three are a left-handed frame, which is tried elsewhere.
     """
     for order in permutations(range(3)):
         if order != (0, 1, 2):
@@ -414,7 +427,12 @@ def _other_positions(position: Array) -> Iterator[tuple[str, Array, dict[str, st
 def _row_mistakes(
     session: SessionData, stated: Hypothesis, rows: Indices, exchangeable: Sequence[int]
 ) -> Iterator[Hypothesis]:
-    """Yield poses that belong to other rows: for all views alike, then with two of some views exchanged."""
+    """Yield the poses without a mistake of their order: reversed, sorted as text, shifted, or two rows exchanged.
+
+    Args:
+        rows: numbers of the views that are tried.
+        exchangeable: positions among `rows` of views of which two may be exchanged.
+    """
     T = stated_hypothesis(session).T_base_flange
     count = len(T)
     yield stated.undone("reversed", T[::-1][rows])
@@ -435,12 +453,19 @@ def _row_mistakes(
 
 
 def distinct(tried: Sequence[Hypothesis], angle: float, length: float) -> list[Hypothesis]:
-    """Return hypotheses whose relative motions differ, the first of each kind kept."""
+    """Return the hypotheses without those that have the same relative motions as an earlier one.
+
+    Those that do not use all views are all kept.
+
+    Args:
+        angle: largest difference of an element of a rotation that counts as the same (rad).
+        length: largest difference of a translation, length_unit.
+    """
     kept = list[Hypothesis]()
     signatures = np.empty((len(tried), 0))
     for h in tried:
         relative = frames.inverse(h.T_reference_mount[:1]) @ h.T_reference_mount[1:]
-        # A motion at a time, so that few of them part most hypotheses.
+        # Twelve numbers a motion: those of the first one tell most hypotheses apart, and are compared first.
         turned_and_moved = [relative[:, :3, :3].reshape(-1, 9) / angle, relative[:, :3, 3] / length]
         signature = np.concatenate(turned_and_moved, axis=1).ravel()
         if not signatures.size:

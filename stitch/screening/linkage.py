@@ -64,10 +64,12 @@ class Linkage:
 
 
 def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
-    """Return the linkage of views by the correspondences at the poses of `overlaps`.
+    """Return which views are linked, by the share of each pair's correspondences that lie within the robust gate.
+
+    Pairs with common targets are always linked.
 
     Args:
-        holding_nothing: views whose scans hold no pose, however well they lie on the others.
+        holding_nothing: views whose scans determine no pose, as points in a line: no surface links them.
     """
     gram = overlaps.gram
     matched = {(m.v, m.w): len(m.residual) for m in overlaps.matches}
@@ -87,7 +89,7 @@ def pair_holds(count: int, matched: int) -> bool:
 
 
 def linkage_of_pairs(views: int, pairs: Sequence[tuple[int, int]]) -> Linkage:
-    """Return the linkage of V views from the pairs that hold."""
+    """Return the linkage of V views from linked pairs: connected components, largest first, and views with one link."""
     near = np.zeros((views, views), bool)
     for v, w in pairs:
         near[v, w] = near[w, v] = True
@@ -105,19 +107,18 @@ def find_contradicting_views(
     share: float = CONTRADICTS,
     groups: Sequence[Sequence[int]] = (),
 ) -> tuple[int, ...]:
-    """Find views that show a surface where others show it elsewhere, facing the same way; the worst first.
+    """Return the views that show a surface which other views show elsewhere, the worst first.
 
-    Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
-    stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the
-    scan or two scans are in one file, fits with one half and contradicts with the other. Each view is asked without
-    those before it.
+    Residuals do not show such a scan: points beyond the gate have no correspondence, the few that fit remain. The part
+    may have moved during it, or two scans be in one file. The worst view is taken out and the others are tested again
+    without it, until none is left.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views fit best.
         tolerance: distance along the normal that is the same place, length_unit.
         size: of the part, length_unit.
-        share: of what others show of a view that stands elsewhere.
-        groups: views that link each other: only within one is each asked, since groups may stand apart. Empty: all are.
+        share: a view contradicts if significantly more of its points that others show stand elsewhere.
+        groups: linked views: each is compared within its group, since groups may be displaced. (): with all.
     """
     shown = _point_visibility(scans, poses, tolerance, _SEARCH_REACH * size)
     for group in groups:
@@ -136,7 +137,14 @@ def find_contradicting_views(
 
 
 def _contradicted_share(shown: dict[int, PointVisibility], without: Sequence[int], least: float) -> float:
-    """Return the share of points shown by other views that all of these show elsewhere; 0 up to the least one."""
+    """Return the share of a view's points, of those that other views show at all, that none shows in place.
+
+    0 if the share is not significantly above `least`, by a binomial test.
+
+    Args:
+        shown: by other view, what it shows of each point (`PointVisibility`).
+        without: views that do not count.
+    """
     others = [by_view for w, by_view in shown.items() if w not in without]
     if not others:
         return 0.0
@@ -149,9 +157,12 @@ def _contradicted_share(shown: dict[int, PointVisibility], without: Sequence[int
 def _point_visibility(
     scans: Sequence[Scan], poses: Array, tolerance: float, reach: float
 ) -> list[dict[int, PointVisibility]]:
-    """Return by view, and by other view near it, what the latter shows of each point (n,) that the former asks for.
+    """Return per view, by each other view near it, what that shows of the first one's n probed points (n,).
+
+    Values are those of `PointVisibility`. With many views near, points take turns among them; those not asked have 0.
 
     Args:
+        poses: (V, 4, 4) T_reference_scanner.
         tolerance: distance along the normal that is the same place, length_unit.
         reach: how far from a point another surface is sought, length_unit.
     """
@@ -168,7 +179,7 @@ def _point_visibility(
             parts[w].append((v, slice(k % turns, None, turns)))
 
     def of_asked(w: int) -> dict[int, PointVisibility]:
-        """Return by view that asks what view w shows of its points (n,); all that ask w are searched at once."""
+        """Return, by view whose points are sought in view w, what w shows of them (n,); one search for all."""
         if not parts[w]:
             return {}
         _, points, normals = queries.gather(parts[w])
@@ -188,16 +199,28 @@ def _point_visibility(
 
 
 def points_in_place(scan: Scan, points: Array, normals: Array, tolerance: float) -> Mask:
-    """Return (n,) bool: points (n, 3) with normals (n, 3), in the scan's frame, that it shows where they are, however
-    sparse it is there."""
+    """Return a mask (n,) of points that a scan shows at their place: near along the normal, and beside it.
+
+    Beside: within two local spacings, so that a sparse scan counts too.
+
+    Args:
+        points, normals: (n, 3) in the scan's frame.
+        tolerance: distance along the normal, length_unit.
+    """
     reach = float(np.sqrt(scan.area.max())) * _SPACINGS + tolerance
     index, along, beside = _nearest_partners(scan, points, normals, reach)
     return (np.abs(along) < tolerance) & (beside < _SPACINGS * np.sqrt(scan.area[index]))
 
 
 def _nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) -> tuple[Indices, Array, Array]:
-    """Return the point of a scan (n,) nearest to each one in its frame, and how far that is (n,) along and beside its
-    normal: infinitely far beside where it is none, or of the other side of the part."""
+    """Return per point the number (n,) of a scan's nearest point, and the distance along and beside its normal (n,).
+
+    Beside is infinite where there is none within `reach`, or where it is an edge or faces the other way.
+
+    Args:
+        points, normals: (n, 3) in the scan's frame.
+        reach: length_unit.
+    """
     distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
     same_side = np.isfinite(distance)
     partner = np.where(same_side, partner, 0).astype(np.int64)

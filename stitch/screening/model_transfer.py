@@ -69,11 +69,11 @@ def require_matching_hand_eye(
 def check_model_transfer(
     sessions: Sequence[SessionData], applied: FittedRig, fit: Callable[[], FittedRig]
 ) -> list[tuple[str, ...]]:
-    """Return per session of labelled points what is to be doubted of the model of another run.
+    """Return per session of labelled points the warnings about the model of another run; () where it holds.
 
     Args:
         applied: the sessions under that model.
-        fit: hand-eye and targets fitted here, with the arm of that run.
+        fit: fits hand-eyes and targets here, with the arm of that run.
 
     Raises:
         NoResultError: no arm errs by as much as the other run's model leaves.
@@ -167,14 +167,15 @@ def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str,
 
 
 def check_arm_transfer(fit: FitWithArm, arm: ModelFile, fitted: FittedRig, unit: str) -> tuple[bool, str]:
-    """Return True if an arm that was kept holds here, and what it does: held against the nominal one, and against
-    itself without one of its effects.
+    """Return whether the arm of another run holds here, and a sentence that says so.
 
-    What imitates among the poses of one session may err at those of another; base, tool and targets are fitted with
-    either arm, so that nothing but the arm makes the difference.
+    It does not if the nominal arm, or the same arm without one effect, leaves significantly smaller residuals. Base,
+    tool and targets are fitted anew with each, so that only the arm makes the difference.
 
     Args:
-        fitted: the fit with it.
+        fit: fits the sessions with an arm; None: the nominal one.
+        arm: effects of the other run.
+        fitted: the fit with `arm`.
         unit: of length.
     """
     squares = view_mean_squares(fitted)
@@ -202,7 +203,10 @@ def _rms(squares: Array) -> float:
 
 
 def view_mean_squares(fitted: FittedRig) -> Array:
-    """(ΣV,) mean square distance of the targets, or of the surfaces, in every view; NaN where nothing was seen."""
+    """Return mean square distances (ΣV,), length_unit², of surfaces or else targets, in every view of all sessions.
+
+    NaN where nothing was seen.
+    """
     if fitted.correction is not None:
         every = zip(fitted.captures, fitted.correction.overlaps, strict=True)
         return np.concatenate([per_view_rms(overlaps, len(capture.scans)) ** 2 for capture, overlaps in every])
@@ -212,11 +216,10 @@ def view_mean_squares(fitted: FittedRig) -> Array:
 def find_disagreeing_sessions(
     names: Sequence[str], fitted: FittedRig, fit_separately: Callable[[int], FittedRig], unit: str
 ) -> tuple[str, ...]:
-    """Return a doubt of each session that wants effects of its own, beyond chance (F test, Bonferroni over sessions)
-    and by size: sharing costs more than it gives.
+    """Return a sentence on each session of a rig that seems to be of another arm: it needs effects of its own.
 
-    Two arms of one make have the same table and other errors. In one fit with both, what the one does wrong is left in
-    the other, and looks like an effect that is missing.
+    Its residuals must be smaller with its own effects beyond chance (F test, Bonferroni over the sessions), and by so
+    much that sharing costs more than it gives (`compare_with_own_effects`).
 
     Args:
         fitted: the fit of all.
@@ -237,17 +240,16 @@ def find_disagreeing_sessions(
 
 
 def compare_with_own_effects(shared: Array, separate: Array, numbers: int) -> tuple[list[float], float, bool]:
-    """Compare the mean squares of the views (V,) under the effects of all with those under a session's own.
+    """Return three rms of a session, length_unit, a p-value, and whether sharing effects with others costs too much.
 
-    What further views would leave is Akaike's (1970) final prediction error: each parameter that was fitted to these
-    views counts twice.
+    The rms are with shared effects, with its own, and with its own on further views: Akaike's (1970) final prediction
+    error, in which each fitted parameter counts twice. p is that of an F test of its own effects. Sharing costs too
+    much if the first rms exceeds the third by more than its uncertainty, a tenth at least.
 
     Args:
-        numbers: parameters of the effects that were fitted.
-
-    Returns:
-        Rms with the effects of all, with its own, and of further views with its own, length_unit; the chance that these
-        explain so much; True if sharing costs more than it gives.
+        shared: (V,) mean squares of the views under the effects of all sessions, length_unit².
+        separate: (V,) the same under its own.
+        numbers: parameters of its own effects.
     """
     seen = np.isfinite(shared) & np.isfinite(separate)
     views = max(int(seen.sum()), 1)

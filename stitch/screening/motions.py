@@ -61,7 +61,10 @@ class MotionFit:
 
 
 def register_scan_pairs(capture: Capture) -> RelativeScans:
-    """Return the motions between each view and the next two of the list, without any pose."""
+    """Return the scanner's motions between each view and the next two, by surface matching from many starts.
+
+    No pose is used. A motion counts if the surfaces close (`_MIN_SCAN_CLOSURE`) where they are near (`_SHARED`).
+    """
     size = part_size([capture])
     count = len(capture.scans)
     turns = _start_rotations()
@@ -75,7 +78,12 @@ def register_scan_pairs(capture: Capture) -> RelativeScans:
 
 
 def _place_on(capture: Capture, v: int, w: int, turns: Array, size: float) -> Placement:
-    """Return the best placement of scan w in the frame of scan v."""
+    """Return the best placement of scan w on the surface of scan v: T maps scanner frame w to scanner frame v.
+
+    Args:
+        turns: (S, 3, 3) rotations to begin with, the scans' centroids brought together.
+        size: of the part, length_unit.
+    """
     scan, other = capture.scans[w], capture.scans[v]
     tolerance = _SIGMAS * float(np.hypot(scan.noise, other.noise)) / 2 + _CURVED * other.spacing
     surface = surface_of(capture.scans, np.tile(np.eye(4), (len(capture.scans), 1, 1)), [v], tolerance)
@@ -84,7 +92,7 @@ def _place_on(capture: Capture, v: int, w: int, turns: Array, size: float) -> Pl
 
 
 def _start_rotations() -> Array:
-    """(S, 3, 3) rotations: none, and about the twelve axes of an icosahedron."""
+    """Return rotations (S, 3, 3): the identity, and by several angles about the twelve axes of an icosahedron."""
     golden = (1 + np.sqrt(5)) / 2
     axes = np.array([p for a in (-1, 1) for b in (-golden, golden) for p in ((0, a, b), (a, b, 0), (b, 0, a))])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -104,7 +112,10 @@ def alike(T: Array, other: Array, length: float) -> Mask:
 
 
 def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
-    """Return the first hypothesis, and what could close: motions keep their angle under any hand-eye (Chen 1991)."""
+    """Return the first hypothesis, and those whose motions turn by the scanner's angles about as often as the best.
+
+    Under any hand-eye mount and scanner turn by the same angle (Chen 1991), so that this test needs none.
+    """
     v, w = np.array(motions.pairs).T
     angles = rotation_angles(motions.T)
     shares = []
@@ -119,11 +130,14 @@ def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> li
 
 
 def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *, scaled: bool = False) -> MotionFit:
-    """Return the hand-eye of one hypothesis.
+    """Return the hand-eye X of one hypothesis, A·X = X·B, by its rotation first, and how many motions close under it.
+
+    A are motions of the mount under the hypothesis, B those of the scanner. With too few of them the fit is the
+    identity, under which none closes.
 
     Args:
-        length: what a motion may leave open, length_unit.
-        scaled: fit the scale of the robot's lengths too.
+        length: what a motion may leave open, length_unit; of rotations it is `ROTATION`.
+        scaled: fit a factor on the robot's lengths too.
     """
     T = hypothesis.T_reference_mount
     pairs = np.array(motions.pairs, int).reshape(-1, 2)
@@ -141,7 +155,14 @@ def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *
 
 
 def _fit_rotation(A: Array, B: Array) -> tuple[Array, Array]:
-    """Return R_X (3, 3) and per motion what is left, rad: the best of many pairs, then all that agree."""
+    """Return the rotation R_X (3, 3) of A·X = X·B, and per motion the angle (M,), rad, that it leaves.
+
+    RANSAC: pairs of motions each determine a rotation; the best one is refined by all motions that agree with it, and
+    kept as it was if that makes it worse.
+
+    Args:
+        A, B: (M, 4, 4) motions of mount and scanner.
+    """
     a = frames.log(A)[:, :3]
     b = frames.log(B)[:, :3]
     pairs = list(combinations(range(len(a)), 2))
@@ -173,7 +194,16 @@ def _angles_left(A: Array, B: Array, R: Array) -> Array:
 
 
 def _fit_translation(A: Array, B: Array, R: Array, near: Mask, scaled: bool) -> tuple[Array, float, Array]:
-    """Return t_X (3,), scale and per motion what is left of R_A t_X + s t_A = R_X t_B + t_X."""
+    """Return t_X (3,), the scale s, and per motion the residual length (M,) of R_A t_X + s t_A = R_X t_B + t_X.
+
+    Least absolute sum, so that wrong motions pull little.
+
+    Args:
+        A, B: (M, 4, 4) motions of mount and scanner.
+        R: R_X (3, 3).
+        near: (M,) motions whose rotations agree; others hardly count.
+        scaled: s is free; else it is 1.
+    """
     rows = A[:, :3, :3] - np.eye(3)
     right = np.einsum("ij,mj->mi", R, B[:, :3, 3]) - (0 if scaled else 1) * A[:, :3, 3]
     if scaled:
@@ -183,7 +213,13 @@ def _fit_translation(A: Array, B: Array, R: Array, near: Mask, scaled: bool) -> 
 
 
 def _least_absolute(rows: Array, right: Array, weight: Array) -> Array:
-    """Return x (U,) of the least weighted sum of the lengths of rows (M, 3, U) · x − right (M, 3)."""
+    """Return x (U,) that minimises Σ weight · |rows x − right|, by reweighted least squares in `_ABSOLUTE_STEPS` steps.
+
+    Args:
+        rows: (M, 3, U).
+        right: (M, 3).
+        weight: (M,).
+    """
     reweighted = weight
     x: Any = None
     for _ in range(_ABSOLUTE_STEPS):
@@ -198,8 +234,10 @@ def _least_absolute(rows: Array, right: Array, weight: Array) -> Array:
 def fit_positions(
     R: Array, known: tuple[Array, Array], mount: Mount, motions: RelativeScans, used: Collection[int], R_mount: Array
 ) -> Array:
-    """Return (V, 3) positions p + Q·u of the flange, of which a table lost something: with the u under which most
-    motions close by A·X = X·B, least absolute sum.
+    """Return positions p + Q·u (V, 3) of the flange, with the unknown u under which the motions close best.
+
+    A·X = X·B for motions A of the mount and B of the scanner is linear in u and the hand-eye's translation; both are
+    found by the least absolute sum.
 
     Args:
         R: (V, 3, 3) rotations of T_base_flange.

@@ -37,7 +37,10 @@ class MovedTarget:
 
 
 def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
-    """Return targets that moved once, the clearest first; each is asked without those before it."""
+    """Return the targets that moved among the others, the clearest first; each is tested without those found before.
+
+    It ends where no target's step is `LIMIT_TARGET` times the usual, or fewer than `_TARGETS` are left.
+    """
     places = target_positions(sightings)
     sigma = distance_sigma(sightings)
     left = list(range(len(sightings.targets)))
@@ -86,7 +89,11 @@ def _distances_from_median(places: Array, k: int) -> Array:
 
 
 def _partners(places: Array, k: int) -> Indices:
-    """Other targets that hold one (V, K, 3): of those often seen with it some, all over the list."""
+    """Return numbers of the targets often seen together with target k; of many, some spread over the list.
+
+    Args:
+        places: (V, K, 3) of the targets, NaN where a view does not show one.
+    """
     seen = np.isfinite(places[:, :, 0])
     together = seen[:, k].astype(float) @ seen
     together[k] = 0
@@ -116,7 +123,15 @@ def _steps_of_means(off: Array) -> Array:
 
 
 def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
-    """Return by how many times the usual step the distances from target k change before a view, and that move."""
+    """Return by how many times the usual step the distances from target k change at view `start`, and the move.
+
+    Steps are differences of medians before and from that view on, in standard errors. The usual step is that of the
+    distances among the other targets. If a straight line over the session fits clearly better, the target drifts.
+
+    Args:
+        places: (V, K, 3) of the targets, NaN where a view does not show one.
+        sigma: of a distance by the sensor's noise, length_unit.
+    """
     partners = _partners(places, k)
     among = target_distances(places[:, partners])[:, *np.triu_indices(len(partners), 1)]
     distances = _seen_on_both_sides(np.linalg.norm(places[:, partners] - places[:, k : k + 1], axis=2), start)
@@ -159,7 +174,12 @@ def _fitted_lines(distances: Array) -> Array:
 
 
 def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:
-    """(p,) steps of the medians, in length_unit and in standard errors."""
+    """Return the steps (p,) of the medians of p distances at view `start`, in length_unit and in standard errors.
+
+    Args:
+        distances: (V, p) length_unit, NaN where not seen.
+        scatter: robust sigma of one distance, length_unit.
+    """
     levels = _levels(distances, start)
     before = np.isfinite(distances[:start]).sum(axis=0)
     after = np.isfinite(distances[start:]).sum(axis=0)

@@ -52,6 +52,7 @@ def explain_misplaced(
     out = list[SessionProblem]()
 
     def explain(mistake: str, views: Sequence[int], **words: Any) -> None:
+        """Add a problem of some views, which then are no more to be explained."""
         out.append(problem(mistake, [names[v] for v in views], **words))
         for v in views:
             unexplained.pop(v, None)
@@ -93,7 +94,13 @@ def _single_view_problem(
     m: MisplacedView,
     same: Sequence[tuple[int, int]],
 ) -> SessionProblem:
-    """Return what is wrong with a view by itself: its cloud, the pose of another row, one joint, or its pose."""
+    """Return what is wrong with one view: its cloud, a pose copied from another row, one joint, or else its pose.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+        m: how the view stands off; `T` is None where its surface fits nowhere.
+        same: pairs of views that have the very same pose.
+    """
     names = session.names
     name = names[m.view]
     scan = capture.scans[m.view]
@@ -131,7 +138,11 @@ def _single_view_problem(
 def find_wrong_joint(
     session: SessionData, capture: Capture, T_mount: Array, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
-    """Find the joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
+    """Return the joint that alone explains a view's displacement; None where no joint does, or joints are not known.
+
+    Returned are its column in views.csv, the angle stated and the angle that fits (deg), and whether the angle stated
+    is that of the row before or after. It has to leave less than `_MAX_REMAINING_SHARE` of the displacement.
+    """
     robot = session.robot
     joints = session.views[m.view].joints
     if robot is None or joints is None or m.T is None or session.axes:
@@ -140,6 +151,7 @@ def find_wrong_joint(
     there = frames.transform(m.T, points)
 
     def off(q: Array) -> float:
+        """Return the rms distance (length_unit) of the scan's points at joints q (n,), rad, from where they fit."""
         T = forward(robot, q)
         T = frames.inverse(T) if session.mount == "eye_to_hand" else T
         return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
@@ -163,20 +175,28 @@ def find_wrong_joint(
 def find_fitting_rows(
     capture: Capture, snooping: Snooping, misplaced: Sequence[MisplacedView]
 ) -> dict[int, int | None]:
-    """Return for every misplaced scan that fits the part the row to whose pose it belongs; None for no other row."""
+    """Return, by misplaced view whose scan fits the part, the row to whose pose the scan belongs; None: no other row.
+
+    First the row whose pose is near where the scan was placed. Where there is none, and several views are misplaced,
+    scans may slide along the part: then the row at whose pose the scan fits.
+    """
     rows = {m.view: _nearest_row(capture, snooping.expected, m.view, m.T) for m in misplaced if m.T is not None}
     elsewhere = [view for view, row in rows.items() if row is None]
     core = [v for v in snooping.linkage.core if v not in snooping.not_belonging]
     if not elsewhere or not core or len(misplaced) < 2:
         return rows
-    # Where scans slide along the part, each came to rest somewhere else than in the row where it would fit as well.
     surface = surface_of(capture.scans, snooping.unconstrained.poses, core, snooping.tolerance)
     every = [m.view for m in misplaced]
     return rows | {v: _row_where_it_fits(capture, snooping, surface, v, every) for v in elsewhere}
 
 
 def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | None:
-    """Return the row to whose pose a scan that was placed belongs, if to another one."""
+    """Return the row whose pose is near T and much nearer to it than the scan's own row; None if there is none.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner of the rows.
+        T: (4, 4) T_reference_scanner where the scan fits.
+    """
     off = _pose_distances(capture, view, T, poses)
     best = int(np.argmin(off))
     close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER_SHARE * off[view]
@@ -186,7 +206,13 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
 def _row_where_it_fits(
     capture: Capture, snooping: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
 ) -> int | None:
-    """Return the row in which a scan, moved least, fits the others; None for its own."""
+    """Return the row at whose pose a scan fits the surface after the smallest motion; None if that is its own.
+
+    Args:
+        surface: of the views that belong together.
+        view: number of the scan.
+        rows: numbers of the rows that are tried.
+    """
     near = CLOSE_SHARE * part_size([capture])
     moved = dict[int, float]()
     for row in rows:
@@ -207,7 +233,11 @@ def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Arra
 
 
 def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
-    """Find closed rounds of scans that stand in each other's rows."""
+    """Return cycles of views: the scan of each belongs to the row of the next, that of the last to the first row.
+
+    Args:
+        rows: by view, the row to whose pose its scan belongs; None: not known.
+    """
     cycles = []
     seen = set[int]()
     for start in sorted(rows):
@@ -223,10 +253,12 @@ def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
 
 
 def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedView]) -> list[tuple[int, int]]:
-    """Find pairs of views of which one's scan fits the other's pose, whose own scan shows too little.
+    """Return pairs (view, row): the view's scan alone fits the row's pose, and the row's own scan fits nowhere.
+
+    Then the two are probably exchanged, and the second shows too little to prove it.
 
     Args:
-        rows: of `find_fitting_rows`, less those of closed rounds.
+        rows: of `find_fitting_rows`, without the views of cycles.
     """
     silent = {m.view for m in misplaced if rows.get(m.view) is None} & set(rows.values())
     claimed = {row: [v for v, other in rows.items() if other == row] for row in silent}

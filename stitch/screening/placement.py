@@ -68,7 +68,16 @@ class ReferenceSurface:
         return 2 * self.spacing + 3 * self.tolerance
 
     def meets(self, poses: Array, points: Array, normals: Array, gate: float) -> tuple[Array, Array, Mask, Mask]:
-        """Signed distance (S, n), normal of the partner (S, n, 3), and: one within `gate` faces alike, one is near."""
+        """Return, for n points at S poses, the signed distance (S, n), normal (S, n, 3), and two masks (S, n).
+
+        The first mask: the nearest surface point within `gate` faces the same way; the second: there is one at all.
+        Distances and normals are those of the surface point, reference frame; arbitrary where there is none.
+
+        Args:
+            poses: (S, 4, 4) T_reference_scanner.
+            points, normals: (n, 3) scanner frame.
+            gate: length_unit.
+        """
         placed = frames.transform(poses, points)
         distance, partner = self.tree.query(np.ascontiguousarray(placed.reshape(-1, 3)), distance_upper_bound=gate)
         near = np.isfinite(distance).reshape(placed.shape[:2])
@@ -93,7 +102,13 @@ class Placement:
 
 
 def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolerance: float) -> ReferenceSurface:
-    """Return the surface that some views show under poses (V, 4, 4) T_reference_scanner."""
+    """Return the surface that some views show together, as points with normals in the reference frame.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner of all scans.
+        views: numbers of the scans that count.
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
+    """
     views = list(views)
     picked = {v: sample_points(scans[v], max(_SURFACE_POINTS // max(len(views), 1), 200)) for v in views}
     points, normals = _points_of(scans, poses, picked)
@@ -128,10 +143,10 @@ def evaluate_placement(scan: Scan, T: Array, surface: ReferenceSurface) -> Place
 
 
 def _evaluate_placements(scan: Scan, poses: Array, surface: ReferenceSurface, probes: int) -> list[Placement]:
-    """Return how a scan closes with a surface at each of some poses (S, 4, 4): the share that is near it, and on it.
+    """Return per pose (S, 4, 4) the share of a scan's points that lie near a surface, and of these the share on it.
 
     Args:
-        probes: points of the scan that are asked.
+        probes: number of points of the scan that are tested.
     """
     index = sample_points(scan, probes)
     if not len(index):
@@ -144,10 +159,14 @@ def _evaluate_placements(scan: Scan, poses: Array, surface: ReferenceSurface, pr
 
 
 def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float) -> list[Placement]:
-    """Return the best few placements of a scan on a surface, best first, after closing in from every start (S, 4, 4).
+    """Return the `_KEPT` best placements of a scan on a surface, by ICP from every start, best first.
+
+    Few points from all starts, with a gate that shrinks; then the best ones with more points. Best is the largest share
+    of points on the surface.
 
     Args:
-        size: of the part, length_unit: the search reaches a third of it.
+        starts: (S, 4, 4) T_reference_scanner.
+        size: of the part, length_unit: the first gate is a third of it.
     """
     gates = np.maximum(size * np.geomspace(_FIRST_GATE, _LAST_GATE, _STEPS), 1.5 * surface.spacing)
     poses = _icp_scan(scan, surface, starts, gates, _COARSE_PROBES)
@@ -158,11 +177,12 @@ def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float
 
 
 def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array, probes: int) -> Array:
-    """Return poses (S, 4, 4) of a scan after one Gauss–Newton step of point-to-plane ICP per gate from every start.
+    """Return poses (S, 4, 4) of a scan after point-to-plane ICP from every start, one Gauss–Newton step per gate.
 
     Args:
-        gates: largest distances between partners, length_unit, one after the other.
-        probes: points of the scan that are asked.
+        starts: (S, 4, 4) T_reference_scanner.
+        gates: largest distances between corresponding points, length_unit, one after the other.
+        probes: number of points of the scan that are matched.
     """
     index = sample_points(scan, probes)
     points, normals = scan.points[index], scan.normals[index]
@@ -188,7 +208,13 @@ def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array
 
 
 def starts_about(T: Array, scan: Scan, size: float) -> Array:
-    """Return (S, 4, 4) a pose and its neighbours: a third of the part along, and 12° about, each axis."""
+    """Return a pose T (4, 4) and 12 neighbours, (13, 4, 4): 12° about, and a third of the part along, ± each axis.
+
+    Rotations are about the centroid of the scan.
+
+    Args:
+        size: of the part, length_unit.
+    """
     centre = frames.transform(T, scan.points.mean(axis=0)[None])[0]
     to = frames.make(np.eye(3), -centre)
     turns = [frames.make(Rotation.from_rotvec(axis * _START_TURN).as_matrix(), np.zeros(3)) for axis in _AXES]
@@ -197,9 +223,13 @@ def starts_about(T: Array, scan: Scan, size: float) -> Array:
 
 
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
-    """Return the share of a scan on the surface of the others at which it counts as placed.
+    """Return the closure (share of near points that lie on the surface) from which a scan counts as placed.
 
-    A fixed share of what is usual: of linked views, some of which are held against the others where they are.
+    It is `_ACCEPTED_CLOSURE` of the median closure of some linked views at their poses; of 1 where none is unlinked.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
     """
     core = linked.core
     if not linked.unlinked or len(core) < 2:
@@ -218,17 +248,16 @@ def place_unlinked_views(
     linked: Linkage,
     limits: tuple[float, float],
 ) -> tuple[dict[int, Placement], list[int], set[int]]:
-    """Find where the views outside the core belong, and those that belong nowhere; the core grows as they are placed.
+    """Return the unlinked views that can be placed, those that cannot, and of these the ones that fit several places.
 
-    On a part that looks alike from several sides a view may close at several places: which is its own is not known, and
-    it belongs nowhere unless one of them is its row's.
+    The core is the largest group of linked views. Other groups are placed first, each as a whole, then single views;
+    each one placed joins the core, and the others are tried again. On a part that looks alike from several sides a view
+    may fit several places: it is not placed unless one of them is its row's pose.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
-        limits: distance from the surface that still lies on it, length_unit, and the closure needed.
-
-    Returns:
-        Views that are placed, those that are not, and of these the ones that close at several places.
+        unconstrained: the views moved by the overlaps alone.
+        limits: largest distance from the surface that lies on it, length_unit, and the closure needed.
     """
     if not linked.unlinked or len(linked.core) < 2:
         return {}, list(linked.unlinked), set()
@@ -259,8 +288,8 @@ def place_unlinked_views(
         placed |= new
         core += list(new)
         waiting = [v for v in waiting if v not in new]
-    # What displaces the views of a group they share: where all of them together closed nowhere, each of them may still
-    # close where the part looks alike. So those that were placed alone, at no row's pose, belong nowhere.
+    # The views of a group share their displacement. If the group fits nowhere, a single view that fits somewhere, and
+    # not at a row's pose, does so only because the part looks alike there.
     in_groups = {v for group in linked.components[1:] if len(group) > 1 for v in group}
     unsure = {
         v
@@ -273,7 +302,14 @@ def place_unlinked_views(
 def _place_alone(
     capture: Capture, model_poses: Array, view: int, surface: ReferenceSurface, limits: tuple[float, float]
 ) -> tuple[Placement | None, bool]:
-    """Return where a scan closes by itself, None if nowhere, and True if it does elsewhere too, but not at its row."""
+    """Return where a single scan fits the surface, None if nowhere, and whether it fits another place about as well.
+
+    A fit at its own row's pose is taken at once, without rivals. Starts: about its row, at all rows, and anywhere.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner of the rows.
+        limits: the closure needed, and the size of the part, length_unit.
+    """
     _, size = limits
     scan = capture.scans[view]
     # The scan's centre on the surface's centre, turned every way.
@@ -295,9 +331,12 @@ def _place_alone(
 def closed_placements(
     scan: Scan, placements: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
 ) -> list[Placement]:
-    """Return the placements that close, the nearest to any row's pose first.
+    """Return the placements with enough closure, the nearest to any row's pose first.
+
+    At a row's pose less is needed (`_CLOSURE_AT_ROW`), since a wrong placement seldom lies there.
 
     Args:
+        model_poses: (V, 4, 4) T_reference_scanner of the rows.
         limits: the closure needed, and the size of the part, length_unit.
     """
     needed, size = limits
@@ -321,10 +360,10 @@ def _distance_from_rows(scan: Scan, placement: Placement, model_poses: Array) ->
 
 
 def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
-    """Find where the views of groups outside the core belong, each group moved as a whole; the core grows with them.
+    """Return the placements of the views in groups outside the core, each group moved as one body.
 
-    What displaces the views of a group they share. Each alone may show too little of the others, or close in a wrong
-    place; all of them close in one.
+    The views of a group share their displacement: together they show more of the others' surface than each alone. A
+    group that is placed joins the core; one that fits nowhere is left out.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views of each group fit together.
@@ -350,7 +389,7 @@ def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[
 
 
 def _merge_scans(scans: Sequence[Scan], poses: Array, group: Sequence[int]) -> Scan:
-    """Return some points of all views of a group as one scan in the reference frame."""
+    """Return some points of all views of a group as one scan, whose frame is the reference frame."""
     picked = {v: sample_points(scans[v], _GROUP_PROBES) for v in group}
     points, normals = _points_of(scans, poses, picked)
     return replace(

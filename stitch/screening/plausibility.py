@@ -50,7 +50,10 @@ def beyond_effects(session: SessionData, rotation: float, translation: float) ->
 
 
 def apply_displacement_limits(session: SessionData, snooping: Snooping) -> Snooping:
-    """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
+    """Return the findings with suspected views counted as misplaced if an effect of the arm cannot explain them.
+
+    That is so if the smallest displacement that their evidence admits is larger than what effects do.
+    """
     beyond = [m for m in snooping.suspected if beyond_effects(session, *m.at_least)]
     return replace(
         snooping,
@@ -110,7 +113,9 @@ def snooping_warnings(session: SessionData, capture: Capture, snooping: Snooping
 def background_problems(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> list[SessionProblem]:
-    """Return the problems of what the scans show beside the part: static background, or what only one scan shows.
+    """Return the problems of what the scans show beside the part: background that stands still, or things in the way.
+
+    The second are only asked if there is no background, and no view is left out or displaced.
 
     Args:
         T_mount: (4, 4) hand-eye under which `snooping` was made.
@@ -139,7 +144,11 @@ def background_problems(
 
 
 def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str:
-    """Return a warning of poses that scatter as those of no arm do, with the views that move farthest."""
+    """Return a warning of poses that scatter more than those of any arm, with the views farthest from their pose.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+    """
     model_poses = capture.poses(T_mount)
     twists = frames.log(snooping.unconstrained.poses @ frames.inverse(model_poses))
     middles = np.array([points.mean(axis=0) for points in capture.visible_points])
@@ -151,10 +160,11 @@ def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snoop
 
 
 def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
-    """Return a warning of few views of which one is likelier off than not, or that nothing can be tested by.
+    """Return a warning of a session of few views, or None.
 
-    Weighed against what ordinary arms leave. None where they leave as much, or where the views are enough for each to
-    be tested by the others.
+    There are four: no test is possible; the views overlap too little; one view is off, by odds against ordinary errors
+    of an arm; the same, and which one it is. None if a view is left out, if there are enough views for the tests, or if
+    the odds are below `_DOUBTED_FROM`.
     """
     views = len(session.views)
     unit = session.length_unit
@@ -198,9 +208,10 @@ class Rounding:
 
 
 def rounding_that_explains(session: SessionData, snooping: Snooping) -> Rounding | None:
-    """Return the rounding of the table's rotations, if it turns poses by more than arms do and as much as they scatter.
+    """Return the rounding of the table's rotations if it explains the scatter of the poses; else None.
 
-    It is asked before rows are blamed: no row of such a table is wrong.
+    It must exceed the usual scatter of arms, and agree with the scatter found within a factor of `_TIMES_ROUNDING`.
+    Callers ask it before they blame rows, since no row of such a table is wrong.
     """
     rounding = find_rounding(np.array([view.T_base_flange for view in session.views]))
     if rounding is None or rounding.rotation < usual_twist(session.length_unit)[0]:
@@ -211,7 +222,10 @@ def rounding_that_explains(session: SessionData, snooping: Snooping) -> Rounding
 
 
 def find_rounding(T: Array) -> Rounding | None:
-    """Find the decimals of the rotations of poses (V, 4, 4); None where they have more, or too few poses turn."""
+    """Return to how many decimals the rotations of poses (V, 4, 4) were rounded; None where no rounding is seen.
+
+    Quaternions are tried, then angles (deg) in every order: all numbers must be whole multiples of the step.
+    """
     R = Rotation.from_matrix(T[:, :3, :3])
     if len(T) < _FEWEST_ROUNDED or frames.angle_between(T[0], T[1:]).max(initial=0.0) == 0:
         return None
@@ -230,7 +244,10 @@ def find_rounding(T: Array) -> Rounding | None:
 
 
 def _quaternions_have(q: Array, step: float) -> bool:
-    """Return True if each quaternion (V, 4), of any length near 1, has whole numbers of a step."""
+    """Return whether all quaternions (V, 4), each times some factor near 1, are whole multiples of a step.
+
+    The factor undoes normalisation after rounding: it makes the largest element a whole number of steps.
+    """
     largest = np.abs(q).max(axis=1)
     # What was normalised was shorter or longer by a few steps.
     counts = np.round(largest / step)[:, None] + np.arange(-2, 3)

@@ -135,19 +135,20 @@ def pose_tests(
     usual: UsualEffects | None,
     chance: float = STEP_CHANCE,
 ) -> BlunderSearch:
-    """Return single views that are off, and steps, which all views from one on share.
+    """Return the single views that are off their pose, and the steps: displacements common to all views from one on.
 
-    Views that overlap no other are tested by themselves first, and the rest beside those of them that are off. Steps
-    are sought beside single views, each of which may look like one; where there is a step, single views are sought once
-    more beside it, since a view at the step may have stood for one of its sides.
+    Views that were placed by their surfaces are tested first, then all others with these free. Steps are tested with
+    the single views that are off free. If there is a step, single views are tested again with it free, since a view at
+    the step may have stood in for it.
 
     Args:
         model: the evidence about the views' poses.
         unconstrained: the views where their surfaces put them.
-        unplaced: views that no surface holds: they stay free.
+        unplaced: views that no surface holds: they are free in all tests.
         placed: views that overlapped no other, and were placed by their surfaces.
-        usual: effects by which poses may err beside white scatter; in many views it takes minutes to test against them.
-        chance: that a session without a step shows one.
+        usual: effects that steps are tested against, beside white scatter; None, or with `MAX_VIEWS_WITH_EFFECTS` views
+            or more, which would take minutes: white scatter alone.
+        chance: level of the test of steps.
     """
     unlinked_blunders = _find_unlinked_blunders(model, unplaced, placed)
     search = find_blunders(model, [*unplaced, *unlinked_blunders])
@@ -166,17 +167,17 @@ def pose_tests(
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
-    """Return the blunders among the views of a model, by the generalised extreme Studentised deviate (Rosner 1983).
+    """Return the blunders among the views, by the generalised extreme Studentised deviate (Rosner 1983).
 
-    The worst view is let go, and the next is sought under the scatter of the rest; the largest count whose last view is
-    significant holds, so that several do not hide in the scatter which they inflate.
+    The most deviant view is freed, the scatter of the others estimated anew, and so on. The number of blunders is the
+    largest count whose last view is significant: so several do not hide in the scatter that they inflate.
 
     Args:
-        excluded: views that are known to be off: they stay free and are not counted.
-        steps: what all views from one on have in common.
+        excluded: views known to be off: they are free and not counted.
+        steps: displacements of all views from one on: they are free too.
     """
     freed = list[int]()
-    # One more than views are freed: what is left after each number of them.
+    # One state per number of freed views, from none on: fit, columns of the mean, projector.
     states = list[tuple[VarianceFit, Array | None, Projector]]()
     columns = _free_view_columns(model, excluded, steps)
     most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
@@ -203,7 +204,14 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
 def _find_unlinked_blunders(
     model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
 ) -> list[int]:
-    """Return the unlinked views that the scatter of all others does not explain."""
+    """Return the unlinked views whose displacement the scatter of all others does not explain, at level `FAMILY_WISE`.
+
+    Each is tested with the excluded ones and the other unlinked ones free.
+
+    Args:
+        excluded: views that are free in all tests.
+        unlinked: views to test, placed by their surfaces.
+    """
     blunders = []
     for v in unlinked:
         others = [*excluded, *(w for w in unlinked if w != v)]
@@ -223,13 +231,16 @@ def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequenc
 def find_steps(
     model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
 ) -> tuple[PoseStep, ...]:
-    """Return the steps, first to last, that explain the views better than single views that are off do.
+    """Return the steps in the order of their views: displacements that all views from one on share.
+
+    They are searched with only the known views free, and again with all single blunders free. The second result is
+    taken where the first has none, or where it has the smaller Akaike criterion.
 
     Args:
-        model: its scatter holds all that may happen without a step.
-        first: (n, K) columns of views that are known to be off.
-        singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
-        chance: that a session without a step shows one.
+        model: its covariance has all that may happen without a step.
+        first: (n, K) columns of views known to be off.
+        singles: columns (n, K) of these and of all single blunders, and the number of single blunders.
+        chance: level of the test of a step.
     """
     single_columns, single_count = singles
     steps, columns = _search_steps(model, first, chance)
@@ -251,14 +262,19 @@ class _Pick:
 
 
 def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
-    """Return the steps found on top of columns (n, K) that are in the mean already, and all columns with them and with
-    the single views picked beside them.
+    """Return the significant steps, and the columns of the mean with all that was picked: steps and single views.
 
-    As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
-    back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
+    In turn the step or single view that explains most is added, significant or not, up to `_MAX_STEPS` beyond the last
+    significant one (as Rosner 1983): a body moved there and back makes two steps, and each hides in the scatter that
+    the other makes. At the end each step is tested with all others free.
+
+    Args:
+        first: (n, K) columns that are in the mean already.
+        chance: level of the test of a step.
     """
 
     def with_columns_of(picks: Sequence[_Pick]) -> Array | None:
+        """Return the first columns and those of some picks."""
         return hstack_columns(first, *(pick.columns for pick in picks)) if picks else first
 
     picked = list[_Pick]()
@@ -289,12 +305,17 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
 
 
 def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
-    """Return the likeliest step, or single view that is off, beside some columns; None where these leave no view."""
+    """Return the step, or single view, that explains most with some columns free; None where these leave no view.
+
+    Args:
+        columns: (n, K) in the mean already.
+        taken: by body, the views at which earlier steps begin: these are not tried again.
+    """
     under = projector(model, model.fit(columns), columns)
     mean = model.mixed(columns).A[0]
 
     def says_more(displaced: Array) -> bool:
-        # What the orthonormal columns of the mean hold says nothing more.
+        """Return whether columns (n, 6) are not contained in the orthonormal columns of the mean."""
         rest = displaced - mean @ (mean.T @ displaced)
         return bool(np.linalg.norm(rest) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
 
@@ -309,7 +330,7 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
     tests = dict(zip(more, test_alternatives(under, list(more.values())), strict=True))
     view = min(alone, key=lambda v: alone[v].rank)
     likelier = min(tests, key=lambda at: tests[at].rank, default=None)
-    # Of few views every start of a step may be taken.
+    # `likelier` is None where every start of a step is taken already, as with few views.
     if likelier is None or alone[view].rank < tests[likelier].rank:
         return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
     best = dict[MovedBody, int]()
@@ -321,12 +342,12 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
 
 
 def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
-    """Return the likelier one of a step of the part and one of the scanner, with its size.
+    """Return a step as one of the part or one of the scanner, whichever is likelier, with its size and p-value.
 
     Args:
-        columns: (n, K) of what else there is.
-        best: the view from which on each of the two would have moved.
-        tests: how many steps were looked at.
+        columns: (n, K) of all else in the mean.
+        best: by body, the view at which its step would begin.
+        tests: number of steps tried, by which p is multiplied (Bonferroni).
     """
     with_step = {moved: hstack_columns(columns, model.steps[moved][best[moved]]) for moved in MOVED_BODIES}
     deviance = {moved: model.deviance(with_step[moved]) for moved in MOVED_BODIES}
@@ -349,7 +370,11 @@ def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody
 def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
     """Return Akaike's criterion for few observations (Hurvich and Tsai 1989), inf where parameters use them up.
 
-    It is needed, since half of the views, let go, would leave no scatter.
+    −2 log likelihood + 2kn/(n − k − 1), of n numbers and k free parameters. The plain criterion would prefer to free
+    half of the views, which leaves no scatter.
+
+    Args:
+        columns: (n, K) in the mean beside the hand-eye; None: none.
     """
     count = len(model.z)
     fitted = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
@@ -359,16 +384,14 @@ def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
 def expected_poses(
     model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: BlunderSearch
 ) -> Array:
-    """Return where views are expected: hand-eye and steps estimated together, without the views that stand off.
+    """Return the poses T_reference_scanner (V, 4, 4) at which views are expected: by hand-eye and steps together.
 
-    Across a step the hand-eye alone is a compromise, and every view stands off from it by its share of the step.
+    A hand-eye fitted without the steps is a compromise between both sides. Views that stand off are free in the fit. Of
+    each step the smallest displacement that the evidence admits is taken.
 
     Args:
-        model_poses: (V, 4, 4) T_reference_scanner from which the evidence is counted.
-        unconstrained: the views from there where surfaces put them.
-
-    Returns:
-        (V, 4, 4) T_reference_scanner.
+        model_poses: (V, 4, 4) T_reference_scanner about which the model is linear.
+        unconstrained: the views where surfaces put them, with twists from these poses.
     """
     alone = tests.standing_off
     moved = []
@@ -393,13 +416,13 @@ def expected_poses(
 def least_displacement(
     model: ViewModel, search: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
 ) -> DisplacementSize:
-    """Return the smallest rotation (rad) and shift (length_unit) of a view that its evidence admits.
+    """Return the smallest rotation (rad) and shift (length_unit) of a view that its evidence admits, at 99 %.
 
     Args:
-        search: the scatter of the poses.
-        others: views that are off beside this one: they stay free.
-        steps: what all views from one on share: they stay free too.
-        view: the one that is asked.
+        search: has the scatter of the poses.
+        others: further views that are off: they are free.
+        steps: displacements of all views from one on: they are free too.
+        view: number of the view.
         middle: (3,) centroid of its points, whose shift counts, reference frame.
     """
     under = projector(model, search.fit, _free_view_columns(model, others, steps))
@@ -413,14 +436,15 @@ def least_displacement(
 def length_problem(
     model: ViewModel, T_reference_mount: Array, further: Array | None = None, likely: bool = False
 ) -> SessionProblem | None:
-    """Test the robot's lengths as one factor on all its translations; None if they agree with the scans'.
+    """Return the problem that the robot's lengths differ from the scans' by a factor; None if they agree.
 
-    Under a wrong one the part would come out whole but of the wrong size, and fit itself.
+    The factor is tested as one more column. It must exceed 1 by `_SCALE`, significantly. Under a wrong factor the part
+    would still fit itself, but have the wrong size.
 
     Args:
-        further: (n, K) columns of what was found beside: a factor must not explain what single views do.
         T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
-        likely: the poses contradict the scans, and what is asked for is why.
+        further: (n, K) columns of blunders and steps, which a factor must not stand in for; None: none.
+        likely: the poses are known to contradict the scans: then a larger p-value is enough.
     """
     column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
     if further is not None and model.deviance(column) + 2 < model.deviance(further) + 2 * further.shape[1]:

@@ -42,11 +42,13 @@ class SessionProblem:
 
 
 def displacement_text(best: DisplacementSize, least: DisplacementSize, length_unit: str) -> str:
-    """Return a displacement in words: its estimate, or "at least" its lower bound where surfaces hold it no better;
-    "" where arms repeat no better.
+    """Return a displacement in words: its estimate, or "at least" and its lower bound where these differ as printed.
+
+    A rotation or shift whose bound is within the usual repeatability of arms is left out; "" if both are.
 
     Args:
-        best, least: the estimate, and the smallest displacement that the evidence admits.
+        best, least: the estimate and the smallest displacement that the evidence admits: rotation (rad) and shift
+            (length_unit).
     """
     usual_angle, usual_length = usual_twist(length_unit)[[0, 3]]
 

@@ -37,10 +37,14 @@ ScanFault = tuple[str, dict[str, Any]]
 
 
 def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
-    """Return what makes a scan close on the surface of the others, at its pose or near it; None if nothing does.
+    """Return the mistake of a cloud that, undone, makes it fit the surface of the others; None if there is none.
+
+    Tried are reflections (at its own pose), other units (anywhere), and other factors. A reflection counts only if it
+    is the only one that fits.
 
     Args:
         T_pose: (4, 4) T_reference_scanner from the robot.
+        surface: of the other views.
         size: of the part, length_unit.
         needed: closure that counts as closed.
     """
@@ -53,7 +57,7 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
         near = [p for p in placements if p.near > 0.3 and _moved(other, T_pose, p.T) < reach]
         return max((p.closure for p in near), default=0.0) > needed
 
-    # The pose of a mirrored scan is right: on a part that looks alike in a mirror, others close elsewhere too.
+    # The pose of a mirrored scan is right: on a symmetric part a wrong reflection may fit, but elsewhere.
     mirrored = [name for name, flip in _FLIPS.items() if closes(scan.points @ flip, scan.eye @ flip, _STAYS * size)]
     if len(mirrored) == 1:
         return "mirrored cloud", {"flip": mirrored[0]}
@@ -64,14 +68,20 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
 
 
 def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
-    """Return a factor on the cloud under which it closes at its own pose; None if there is none."""
+    """Return a factor on the cloud under which it fits the others' surface at its own pose; None if there is none.
+
+    Args:
+        T_pose: (4, 4) T_reference_scanner from the robot.
+        size: of the part, length_unit.
+        needed: closure from which a scan counts as placed.
+    """
     starts = np.concatenate([T_pose[None], starts_about(T_pose, scan, size)])
     scale = _fit_scale(scan, place_scan(scan, surface, starts, size)[0].T, surface, size)
     if not (_LEAST_SCALE < scale < 1 / _LEAST_SCALE) or abs(scale - 1) < _NEAR_ONE:
         return None
     other = prepare_scan(scan.name, scan.points * scale, eye=scan.eye * scale)
     if evaluate_placement(other, T_pose, surface).closure < needed:
-        # The factor from the shape is good to a thousandth; the range that it leaves is one of millimetres.
+        # The factor is known from the shape to about a thousandth. Times the range, that is a shift of millimetres.
         placed = place_scan(other, surface, T_pose[None], 0.2 * size)[0]
         allowed = _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(other.points.mean(axis=0))
         if placed.closure < needed or _moved(other, T_pose, placed.T) > allowed:
@@ -86,7 +96,14 @@ def _moved(scan: Scan, T: Array, other: Array) -> float:
 
 
 def _fit_scale(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> float:
-    """Fit a factor on the scan's points to a surface, with its pose: point-to-plane, seven unknowns."""
+    """Return the factor on a scan's points about their centroid that fits a surface best, with the pose free.
+
+    Point-to-plane least squares with seven unknowns, one step per gate.
+
+    Args:
+        T: (4, 4) T_reference_scanner to begin with.
+        size: of the part, length_unit: gates are shares of it.
+    """
     index = sample_points(scan, _PROBES)
     points, normals = scan.points[index], scan.normals[index]
     centre = points.mean(axis=0)
@@ -115,7 +132,7 @@ def find_copies(capture: Capture) -> list[tuple[int, int]]:
 
 
 def _same_points(a: Scan, b: Scan) -> bool:
-    """True if nearly every point of `a` is found in `b`, far closer than two measurements ever agree."""
+    """Return whether nearly every point of `a` is found in `b`, within 1e-4 of the spacing: never so by chance."""
     if abs(len(a.points) - len(b.points)) > 0.02 * max(len(a.points), len(b.points)):
         return False
     index = np.linspace(0, len(a.points) - 1, min(len(a.points), 60)).astype(int)

@@ -131,16 +131,16 @@ def snoop_views(
     unconstrained: UnconstrainedPoses | None = None,
     usual: UsualEffects | None = None,
 ) -> Snooping:
-    """Return which views of a capture do not belong, and what all from one view on share, under a hand-eye.
+    """Return which views of a capture do not belong where the robot has them, and steps, under a hand-eye.
 
-    Views are placed by their surfaces, and the pose of each is tested against where the robot has it; those that stand
-    out are misplaced if usual effects of an arm do not explain them, and suspected else.
+    Views are placed by their surfaces, and each is tested against the robot's pose. One that stands out is misplaced if
+    usual effects of an arm cannot explain it, else suspected. Few views without any finding are weighed together.
 
     Args:
         T_mount: (4, 4) corrected hand-eye.
-        gate: distance between partners at which the correction ended, length_unit.
-        unconstrained: the views freed from there, if that is at hand.
-        usual: what may happen to views beside white scatter; asked only where one stands out, or all from one on.
+        gate: largest distance between corresponding points at the end of the correction, length_unit.
+        unconstrained: the views moved by the overlaps alone; None: computed here.
+        usual: effects that an arm may have; asked only where a view stands out or there is a step. None: no effects.
 
     Raises:
         NoResultError: no two views overlap.
@@ -192,11 +192,11 @@ def snoop_views(
 def _place_across_steps(
     capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
 ) -> tuple[Array, UnconstrainedPoses]:
-    """Return where views are expected, and where overlaps put them: beside a step, if that links more of them.
+    """Return where views are expected, and where overlaps put them, with a step in the poses if that links more views.
 
-    A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than two scans can
-    share. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would be
-    called displaced; one step explains more than that, and views are tried from where it puts them first.
+    A step spoils the hand-eye: views on its smaller side may lie too far from the others to be matched. Placed one by
+    one, such a view could fit a wrong place of a part that looks alike from several sides. So views are first moved by
+    the likeliest step, significant or not: that it links more of them is the proof.
 
     Args:
         T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
@@ -221,15 +221,15 @@ def _place_across_steps(
 
 
 def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
-    """Return where views belong by their surfaces: those that nothing links are tried wide.
+    """Return where views belong by their surfaces; those that no surface links to the others are searched widely.
 
-    First views that contradict the others are set apart, since they would link what does not belong together; then
-    those that are not linked are placed one by one; then, where several were, all by one displacement. Where that
-    changes poses, overlaps are matched anew, and the contradictions asked again.
+    In this order: views that contradict the others are unlinked, since they would link what does not belong together;
+    unlinked views are placed one by one; where several were, one displacement common to all is preferred if it links
+    them. With new poses, overlaps are matched again and contradictions tested again.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
-        unconstrained: the views freed from there.
+        unconstrained: the views moved by the overlaps alone from there.
     """
     lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
     tolerance = _TOLERANCE_SIGMAS * unconstrained.overlaps.gram.scale
@@ -265,19 +265,17 @@ def _place_together(
     unlinked: Collection[int],
     tolerance: float,
 ) -> UnconstrainedPoses | None:
-    """Free unlinked views at one end of the list from where one of them was found, all displaced as it was.
+    """Return the views with unlinked ones at one end of the list all displaced alike; None if that links not all.
 
-    After a knock of the scanner, or a part clamped anew, each of them alone may overlap too little with the others to
-    be placed, and would be taken for a scan of another part.
+    The displacement is that of one view that was placed, as one of the scanner on its mount or as one of the part.
+    After a knock, or a part clamped anew, single views may overlap too little with the others to be placed.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
         unconstrained: the views where overlaps alone put them.
         placed: where some of the unlinked views belong.
-        tolerance: distance that is the same place, length_unit.
-
-    Returns:
-        The unconstrained views, if that links them all and none contradicts; None if no common displacement does.
+        unlinked: views that no surface links to the others.
+        tolerance: distance along the normal that is the same place, length_unit.
     """
     size = part_size([capture])
     for views in end_runs(unlinked, len(model_poses)):
@@ -304,10 +302,11 @@ def end_runs(views: Collection[int], count: int) -> list[range]:
 def _displaced_views(
     capture: Capture, model: ViewModel, expected: Array, located: PlacedViews, tests: BlunderSearch
 ) -> list[MisplacedView]:
-    """Return views that stand off and torn ones, with where the surface of the others puts them.
+    """Return the views that are off by the tests, and torn ones, with their displacement and where their surface fits.
 
     Args:
-        expected: (V, 4, 4) T_reference_scanner by the robot, steps with it: displacements are counted from there.
+        expected: (V, 4, 4) T_reference_scanner by robot and steps, from which displacements are counted.
+        located: where surfaces put the views; torn ones contradict the others wherever they are put.
     """
     unconstrained = located.unconstrained
     blunders = sorted((*tests.unlinked_blunders, *tests.blunders))
@@ -326,9 +325,12 @@ def _displaced_views(
 
 
 def _refine_pose(capture: Capture, unconstrained: UnconstrainedPoses, view: int, tolerance: float) -> Array:
-    """Return T_reference_scanner (4, 4) where the surface of the other views puts one, if that closes better.
+    """Return T_reference_scanner (4, 4) of one view fitted to the surface of all others, if that has more closure.
 
-    Fitted with all others at once, robust weights hold a view back at its old place.
+    In the fit of all views together, robust weights may have held a displaced view back near its old pose.
+
+    Args:
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
     """
     scan = capture.scans[view]
     T = unconstrained.poses[view]

@@ -83,10 +83,10 @@ _SHAPE, _TIMES_USUAL, _OFFSET, _MOST_ASKED = 0.5, 2.0, 4.0, 4
 def find_stock(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> Mapping[int, Stock | None]:
-    """Return the stock of the view that shows it most clearly; {} where none does.
+    """Return the stock of the view that shows it most clearly, by its number; {} where none does.
 
-    Where the scanner errs over its field in all views, or too many show it one after the other, it is none: None for
-    each from which it was taken.
+    The caller takes it off and asks again. If the scanner has unusual errors over its field, or stock was found on too
+    many views, it was no stock: then the result is None for each view from which it was taken, to be given back.
 
     Args:
         T_mount: (4, 4) hand-eye under which `snooping` was made.
@@ -103,7 +103,7 @@ def find_stock(
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
-            # What one view has more of is no error that the scanner makes in all of them.
+            # Without this stock, so that it does not count as an error of the scanner.
             bare = capture.without_stock({view: stock})
             freed = unconstrained_poses(bare, bare.poses(T_mount), unconstrained.overlaps.gate)
             error = field_error(measurement_of(session, bare), Model(T_mount), freed, _UNUSUAL)
@@ -139,11 +139,14 @@ def stock_problems(session: SessionData, capture: Capture) -> Iterator[SessionPr
 def locate_stock(
     session: SessionData, capture: Capture, T_mount: Array, gate: float, stock: Mapping[int, Stock]
 ) -> dict[int, Stock]:
-    """Return the stock of some views, all but its place known, with its points.
+    """Return the stock of some views with the points that have it, found again; thickness and sigma are kept.
+
+    Where it is not found again, all points of the view have it.
 
     Args:
         T_mount: (4, 4) hand-eye that was fitted.
-        gate: distance between partners, length_unit.
+        gate: largest distance between corresponding points, length_unit.
+        stock: by view, with thickness and sigma known, and no points.
     """
     located = dict[int, Stock]()
     for view, known in stock.items():
@@ -156,7 +159,11 @@ def locate_stock(
 
 
 def _asked(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability) -> list[int]:
-    """Return the views that may have stock, the likeliest first."""
+    """Return the views that may have stock, the likeliest first, `_MOST_ASKED` at most.
+
+    A view may if its residuals keep a shape, more than in other views, or if an offset of its whole surface is
+    significant. Views from which stock was taken already are left out.
+    """
     shape = _shape_left(capture, unconstrained)
     offset = _whole_offsets(capture, T_mount, unconstrained, scatter)
     least = max(_SHAPE, _TIMES_USUAL * float(np.median(shape)))
@@ -166,7 +173,8 @@ def _asked(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, 
 
 
 def _shape_left(capture: Capture, unconstrained: UnconstrainedPoses) -> Array:
-    """Return (V,) rms over patches of each view of the median distance that is left, in sigma of a single one."""
+    """Return per view (V,) the rms over patches of its surface of their median residual, in sigma of one residual."""
+    # Each match counts for both of its views, with the residual's sign as either sees it.
     sides = list[list[Match]]([] for _ in capture.scans)
     for m in unconstrained.overlaps.matches:
         sides[m.v].append(m)
@@ -189,7 +197,11 @@ def _shape_left(capture: Capture, unconstrained: UnconstrainedPoses) -> Array:
 def _whole_offsets(
     capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability
 ) -> Array:
-    """Return (V,) by how many sigmas each view lies off as a whole, the poses free under their prior."""
+    """Return per view (V,) by how many sigmas its whole surface is offset along its normals, with all poses free.
+
+    Score test: |c|/√A with c the gradient and A the information of one offset, the twists eliminated. Poses have the
+    robot's prior, with the hand-eye free.
+    """
     overlaps, g = unconstrained.overlaps, unconstrained.overlaps.gram
     weights = [m.weight * tukey(m.residual, g.scale) for m in overlaps.matches]
     sums = OffsetSums(g, overlaps.matches, weights, capture)
@@ -208,13 +220,16 @@ def _whole_offsets(
 def stock_of(
     capture: Capture, T_mount: Array, gate: float, view: int, off: Collection[int], usual: Array
 ) -> Stock | None:
-    """Return the stock that a view shows, None where it shows none or where a displacement explains as much.
+    """Return the stock that a view shows; None where it shows none.
+
+    It must be thick enough, on enough of the surface, and likelier by `_MARGIN` nats than a displaced view and than
+    none, by `_OVER_TORN` than a torn scan.
 
     Args:
         T_mount: (4, 4) hand-eye to begin with.
-        gate: distance between partners, length_unit.
-        off: views that stand off: they take no part.
-        usual: (6,) by which a flange usually turns and moves.
+        gate: largest distance between corresponding points, length_unit.
+        off: views that are off: they are left out.
+        usual: (6,) usual rotations (rad) and translations (length_unit) of a flange.
     """
     case = _hold_against_others(capture, T_mount, gate, view, off, usual)
     if case is None:
@@ -248,12 +263,14 @@ class _Case:
     scatter: float  # of the robot's poses, length_unit
 
     def distances(self, x: Array, offset: Array) -> tuple[Array, Array, Indices, Array, Array] | None:
-        """Return the view's distances (M,) from the others, their weights, its points, the cosine between a point's
-        normal and the mean one, and their change (M, 6V) by twists of all views; None for too few.
+        """Return M correspondences of the view with the others as five arrays; None for fewer than `_FEWEST`.
+
+        They are signed distances (M,), length_unit; weights (M,); numbers (M,) of the view's points; cosines (M,)
+        between their normals and the mean ones; and the change (M, 6V) of the distances by twists of all views.
 
         Args:
-            x: (6V,) by which the views are turned and moved.
-            offset: (N,) by which the view's points are taken back along their normals.
+            x: (6V,) left twists of the views about `centre` from `start`.
+            offset: (N,) shift of the view's points against their normals, length_unit.
         """
         poses = frames.moved_about(self.centre, x.reshape(-1, 6), self.start)
         scan = self.capture.scans[self.view]
@@ -280,14 +297,17 @@ class _Case:
 def _hold_against_others(
     capture: Capture, T_mount: Array, gate: float, view: int, off: Collection[int], usual: Array
 ) -> _Case | None:
-    """Return how a view lies to the others, freed from the robot's poses, under what those show of its scatter.
+    """Return the case of one view against the others: their normal equations, the robot's prior, noise and scatter.
 
-    None where too few views are left.
+    The other views are moved by their overlaps alone, without this view, and their scatter is estimated. None where
+    fewer than `_FEWEST_VIEWS` others are left; the nearest `_MOST_VIEWS` count.
 
     Args:
-        gate: largest distance between partners, length_unit.
-        off: views that stand off: they take no part.
-        usual: (6,) by which poses of an arm usually err, rad and length_unit: scatter is no less than a share of it.
+        T_mount: (4, 4) hand-eye to begin with.
+        gate: largest distance between corresponding points, length_unit.
+        off: views that are off: they are left out.
+        usual: (6,) usual rotations (rad) and translations (length_unit) of a flange: the scatter is no less than a
+            share of it.
     """
     poses = capture.poses(T_mount)
     middles = frames.transform(poses, np.array([[scan.points.mean(axis=0)] for scan in capture.scans]))[:, 0]
@@ -332,9 +352,14 @@ class _Fit:
 
 
 def _fit(case: _Case, kind: str) -> _Fit | None:
-    """Fit all poses to one explanation: `still`, `moved`, or `stock` on the view or on a region of it."""
+    """Return the fit of all poses under one explanation of a view's distances; None where too few remain.
+
+    `still`: the view is held by the robot's prior. `moved`: its pose is free. `stock`: held, with a thickness on it or
+    on a region of it. Each step matches anew, finds the region, and takes a Gauss–Newton step of twists and thickness;
+    the scale of the robust weights is halved from that of all distances to that of noise.
+    """
     K = case.free if kind == "moved" else case.held
-    # Each view begins where robot and hand-eye expect it.
+    # The start: minimum of the others' normal equations with the robot's prior.
     x = -symmetric_inverse(case.H + case.held) @ (case.b + case.held @ case.twists)
     scan = case.capture.scans[case.view]
     thickness, scale = 0.0, np.inf
@@ -369,7 +394,7 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
             scale /= 2
     inside = member & ~edge
     if kind == "stock" and not w[inside].any():
-        # Nothing of a region is left, or nothing lies as far off as it says.
+        # No region is left, or robust weights reject all of it.
         return None
     t = case.twists + x
     held = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
@@ -385,7 +410,14 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
 
 
 def _evidence(case: _Case, left: Array, weight: Array) -> float:
-    """Return the log likelihood of what is left of distances (M,) over that of as many strays."""
+    """Return the log likelihood (nats) of residuals (M,), as normal errors with a share of strays, over strays alone.
+
+    Strays are uniform within the gate; `factor` counts correlated distances as fewer.
+
+    Args:
+        left: (M,) residual distances, length_unit.
+        weight: (M,) of these.
+    """
     normal = np.exp(-0.5 * (left / case.sigma) ** 2) / (np.sqrt(2 * np.pi) * case.sigma)
     likelier = np.log1p((1 - _STRAY) / _STRAY * 2 * case.gate * normal)
     return float(likelier @ weight / weight.mean() / case.factor)
@@ -410,11 +442,16 @@ def _over_torn(case: _Case, rows: Array, e: Array, left: Array, weight: Array) -
 
 
 def _region(places: Array, e: Array, thickness: float, sigma: float) -> tuple[float, Mask, Mask]:
-    """Return the thickness, which distances (M,) are of the region that has it, and which lie at its edge.
+    """Return the thickness of stock, and two masks (M,): distances in the region that has it, and those at its edge.
+
+    In the region the median distance of the neighbours is nearer to the thickness than to zero; two rounds of majority
+    among neighbours smooth it. At the edge neighbours are mixed.
 
     Args:
         places: (M, 3) of the view's points.
-        thickness: 0 at first: then the median of all that lies off.
+        e: (M,) signed distances from the others, length_unit.
+        thickness: from the last step; 0: not known yet, then it is the median of the smoothed distances beyond 2 sigma.
+        sigma: robust, of one distance, length_unit.
     """
     around = KDTree(places).query(places, k=min(_AROUND, len(places)))[1].astype(np.int64)
     smooth = np.median(e[around[:, :_NEIGHBOURS]], axis=1)

@@ -34,7 +34,7 @@ _TRIED, _IN_A_ROW = 60, 6
 
 
 def target_problems(session: SessionData, sightings: Sightings | None) -> list[SessionProblem]:
-    """Return views with names mixed up, then targets that moved, with the views from there on."""
+    """Return the problems of views whose target names are mixed up, then of targets that moved among the others."""
     if sightings is None:
         return []
     names = session.names
@@ -54,7 +54,11 @@ def target_warnings(session: SessionData, sightings: Sightings | None) -> tuple[
 
 
 def check_targets(session: SessionData) -> list[SessionProblem]:
-    """Return what is wrong with the poses of a session of labelled points; empty if nothing is found."""
+    """Return what is wrong with the poses of a session of labelled points; [] if nothing is found.
+
+    First a common move of the base or of all targets. Then, if the poses as stated leave the targets scattered, the
+    hypothesis about the poses that leaves clearly less; if there is none, a problem without a cause.
+    """
     rows = _tried_rows(len(session.views))
     stated = stated_hypothesis(session, rows)
     capture = _capture_of(session, rows)
@@ -93,7 +97,13 @@ def _capture_of(session: SessionData, rows: Indices) -> Capture:
 
 
 def _find_common_move(session: SessionData, rows: Indices, capture: Capture) -> SessionProblem | None:
-    """Find the view from which on everything that the sensor shows stands elsewhere; None if there is none."""
+    """Return the problem that from some view on all targets stand elsewhere; None if there is none.
+
+    The move is found among the rows tried. The rows between the two around it say at which view it begins.
+
+    Args:
+        rows: numbers of the views in `capture`.
+    """
     move = find_common_move(capture)
     if move is None:
         return None
@@ -110,7 +120,10 @@ def _find_common_move(session: SessionData, rows: Indices, capture: Capture) -> 
 
 
 def _motion_seen(capture: Capture) -> float:
-    """Return how far targets move before the sensor, rms (length_unit): no convention of poses changes that."""
+    """Return the rms distance (length_unit) of targets from their mean in the sensor's frame, over all views.
+
+    It says how far the arm moved; no convention of the poses changes it.
+    """
     s = capture.sightings
     assert s is not None
     points, target = s.points[s.used], s.target[s.used]
@@ -119,7 +132,12 @@ def _motion_seen(capture: Capture) -> float:
 
 
 def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:
-    """Yield hypotheses to try: where targets show how the sensor moved, those that explain its motions best."""
+    """Yield hypotheses about the poses: those that explain the sensor's motions best, or all; then other units.
+
+    Args:
+        rows: numbers of the views in `capture`.
+        length: scatter of the targets that counts as good, length_unit; hypotheses closer than a tenth are one.
+    """
     assert capture.sightings is not None
     pairs, T_first_second = sensor_motions(capture.sightings)
     motions = RelativeScans(tuple((int(v), int(w)) for v, w in pairs), T_first_second)
@@ -136,8 +154,10 @@ def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, le
 
 
 def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> float:
-    """Return how far poses leave the sightings of one target apart: median distance from its middle, length_unit, under
-    the hand-eye in closed form; infinite where it has none."""
+    """Return the median distance (length_unit) of sightings from the median of their target, under a hypothesis.
+
+    The hand-eye is that in closed form; infinite where there is none, or no target is seen twice.
+    """
     s = capture.sightings
     assert s is not None
     if hypothesis.used is not None:

@@ -132,7 +132,10 @@ class ViewModel:
 
     @cached_property
     def held_responses(self) -> Array:
-        """(V, n, 6) as `views`, less the directions in which nothing holds a single view."""
+        """(V, n, 6) as `views`, with the directions projected out in which surfaces hardly hold a single view.
+
+        They are right singular vectors of the view's columns whose squared singular value is below `_HELD_SHARE`.
+        """
         _, values, vectors = np.linalg.svd(self.views, full_matrices=False)
         held = vectors * (values**2 > _HELD_SHARE)[:, :, None]
         return self.views @ held.transpose(0, 2, 1) @ vectors
@@ -153,9 +156,10 @@ class ViewModel:
         return hand_eye_mixed_model(self.reduced)
 
     def fit(self, further: Array | None = None) -> VarianceFit:
-        """Fit the scatter of the poses (rotation², translation², noise factor) with further columns in the mean.
+        """Return the variances of the poses' scatter with further columns (n, K) free in the mean; each fit is cached.
 
-        A view more or less in the mean moves the scatter little: every search begins where the last one ended.
+        They are rotation (rad²), translation (length_unit²), noise factor. One view more in the mean changes them
+        little: a search begins where the last one ended.
         """
         key = b"" if further is None else further.tobytes()
         if key not in self._fits:
@@ -164,17 +168,21 @@ class ViewModel:
         return self._fits[key]
 
     def deviance(self, further: Array | None = None) -> float:
-        """Return −2 log of the full likelihood of z with further columns in the mean, comparable between means."""
+        """Return −2 log likelihood of z with further columns (n, K) free in the mean.
+
+        The full likelihood, not the restricted one, so that different means can be compared.
+        """
         fit = self.fit(further)
         C = self.mixed(further).covariance(fit.variances)[0]
         return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).projected)
 
 
 def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses) -> ViewModel:
-    """Reduce unconstrained views to the evidence about their poses.
+    """Return the linear model of what the overlaps say about the poses of all views.
 
     Args:
-        T_mount: (4, 4) hand-eye of the model poses from which the twists of the unconstrained views are counted.
+        T_mount: (4, 4) hand-eye of the model's poses, from which the twists of `unconstrained` are counted.
+        unconstrained: the views moved by the overlaps alone.
     """
     gram = unconstrained.overlaps.gram
     mounts = capture.hand_eye_frames(T_mount)
@@ -196,7 +204,11 @@ class Projector:
 
 
 def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) -> Projector:
-    """Return P for variances that were fitted, with further columns (n, K) in the mean."""
+    """Return P = C⁻¹ − C⁻¹A(AᵀC⁻¹A)⁻¹AᵀC⁻¹ with C the covariance at fitted variances, and A the columns of the mean.
+
+    Args:
+        further: (n, K) columns of the mean beside the hand-eye; None: none.
+    """
     mixed = model.mixed(further)
     A = mixed.A[0]
     inverse = invert_covariance(mixed.covariance(fit.variances)).matrix[0]
@@ -227,7 +239,10 @@ def hstack_columns(*columns: Array | None) -> Array:
 
 
 def test_alternatives(under: Projector, alternatives: Sequence[Array]) -> list[AlternativeTest]:
-    """Test each alternative, columns (n, k), under a null hypothesis: P meets the columns of all at once."""
+    """Return the test of each alternative, columns (n, k) in the mean, under a null hypothesis.
+
+    P is multiplied by the columns of all alternatives in one product, since that takes most of the time.
+    """
     if not alternatives:
         return []
     bounds = np.cumsum([columns.shape[1] for columns in alternatives])[:-1]
@@ -269,15 +284,15 @@ def _tested(under: Projector, columns: Array, weighted: Array) -> AlternativeTes
 def left_out_test(
     model: ViewModel, columns: Array | None, alternative: Array, held: Array
 ) -> tuple[AlternativeTest, float]:
-    """Test an alternative under the scatter that is left where it is free; return the chance of that too.
+    """Return the test of an alternative under the scatter estimated with it free, and the p-value of that.
 
-    One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
-    of a scatter taken from the rest: half of them count.
+    A view that is off inflates the scatter, and with few views hides in it: so it is free while the scatter is
+    estimated. For that p-value half of the degrees of freedom count, since rotations and translations share them.
 
     Args:
-        columns: (n, K) of what else there is.
-        alternative: (n, k).
-        held: (n, k) the same, less directions that nothing holds.
+        columns: (n, K) of all else in the mean; None: none.
+        alternative: (n, k) columns that are free for the scatter.
+        held: (n, k) columns that are tested: those of the alternative without directions that nothing holds.
     """
     under = projector(model, model.fit(hstack_columns(columns, alternative)), columns)
     tested = test_alternative(under, held)
@@ -292,16 +307,24 @@ def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tu
 
 
 def displacement_lower_bound(tested: AlternativeTest, degrees: int) -> Array:
-    """(6,) the displacement nearest to none, rotations in 1/lever, that the evidence tells from the estimate in no more
-    than 1 % of cases; `degrees` of freedom under which the view was tested."""
+    """Return the smallest displacement (6,) in the 99 % confidence region of a test's estimate.
+
+    Rotations count in 1/lever, as displacements at the lever.
+
+    Args:
+        degrees: degrees of freedom of the null hypothesis.
+    """
     return _shortest_within_limit(tested.normal, tested.estimate, _confidence_limit(tested, degrees))
 
 
 def rotation_shift_lower_bounds(tested: AlternativeTest, degrees: int, carried: Array) -> tuple[float, float]:
-    """Return the smallest rotation, in 1/lever, and the smallest shift, whatever the other one is.
+    """Return the smallest rotation (in 1/lever) and the smallest shift (length_unit) in the 99 % confidence region.
+
+    Each is the smallest whatever the other one is.
 
     Args:
-        carried: (6, 6) from displacements as they were tested to those of the point whose shift counts.
+        degrees: degrees of freedom of the null hypothesis.
+        carried: (6, 6) maps displacements as tested to those of the point whose shift counts.
     """
     back = np.linalg.inv(carried)
     N = back.T @ tested.normal @ back
@@ -320,12 +343,13 @@ def _confidence_limit(tested: AlternativeTest, degrees: int) -> float:
 
 
 def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Array:
-    """Return the shortest displacement (k,) that the evidence does not tell from the estimate.
+    """Return the shortest displacement x (k,) with (x − estimate)ᵀ N (x − estimate) ≤ limit; zero if that is allowed.
+
+    Ridge regression: x = (N + pI)⁻¹ N · estimate, with p such that the limit is reached.
 
     Args:
-        normal: (k, k) N, the evidence: dᵀNd is how much worse a displacement off by d explains it.
-        estimate: (k,) the displacement that explains it best.
-        limit: largest dᵀNd.
+        normal: N (k, k).
+        estimate: (k,).
     """
     held, axes = np.linalg.eigh(normal)
     held = np.maximum(held, 0.0)
@@ -334,10 +358,10 @@ def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Arra
         return np.zeros(len(seen))
 
     def missed(log_pull: float) -> float:
+        """Return by how much the quadratic form exceeds the limit under a ridge penalty p, given as its logarithm."""
         pull = np.exp(log_pull)
         return float(held @ (pull / (held + pull) * seen) ** 2 - limit)
 
-    # A pull towards none moves the estimate the farther the less a direction is held.
     strongest = np.log(held[-1])
     pull = np.exp(brentq(missed, strongest - 60, strongest + 60))
     return axes @ (held / (held + pull) * seen)
@@ -358,10 +382,13 @@ class UsualEffects:
         return _TIMES_USUAL * np.hstack(list(self.by_place(unconstrained).values()))
 
     def errors(self, unconstrained: UnconstrainedPoses) -> PoseErrors:
-        """Return the pose errors of a good session: those of arms, and effects, with a variance for each place.
+        """Return the pose errors of a good session as components of a covariance, whose sizes are fitted later.
 
-        How large each is, the views show. Mount and part also wander as slowly as a session is long: they warm up,
-        creep or settle by no law.
+        They are the prior of the arm's errors, slow wandering of mount and part (warming, creep), and per place of the
+        chain (robot, mount, part, …) the effects of the library.
+
+        Args:
+            unconstrained: the views moved by the overlaps alone.
         """
         capture = self.measurement.capture
         centre = unconstrained.overlaps.gram.centre
@@ -407,9 +434,9 @@ class UsualEffects:
 
 
 def thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:
-    """Return unconstrained views with every so many-th correspondence, each of as much more weight.
+    """Return the views with every k-th correspondence only, k times its weight: `_MAX_CORRESPONDENCES` at most.
 
-    What an effect roughly does to poses needs no more.
+    For rough estimates of what effects do to poses, which need no more.
     """
     # Rounded up.
     every = -(-sum(len(m.residual) for m in unconstrained.overlaps.matches) // _MAX_CORRESPONDENCES) or 1

@@ -88,10 +88,14 @@ def fit_screened_views(
     fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
     keep: bool = False,
 ) -> ScreenedFit:
-    """Fit all sessions with the views that belong.
+    """Return the fit of a rig with the views that belong, and per session what was left out and why.
+
+    Fit and screening alternate: stock is taken off first, then views that do not belong are left out, until none is,
+    or for `_MAX_ROUNDS` rounds.
 
     Args:
-        keep: name views that do not belong, but leave them in.
+        fit: fits sessions from their measurements.
+        keep: report views that do not belong, but use them.
 
     Raises:
         InputError: poses contradict the scans, and a usual mistake explains it.
@@ -142,7 +146,11 @@ def _fit_and_screen(
 
 @contextmanager
 def _naming_excluded_views(sessions: Sequence[SessionData], taken: Sequence[ViewScreening]) -> Iterator[None]:
-    """Append to a NoResultError of the block which views were left out before, and why; `taken` by session."""
+    """Add to the message of a NoResultError raised inside which views were left out before, and why.
+
+    Args:
+        taken: per session what was left out so far.
+    """
     try:
         yield
     except NoResultError as error:
@@ -164,8 +172,8 @@ def _screen_session(session: SessionData, fitted: FittedRig, index: int) -> View
 def screen_views(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
     """Return which views of one session of a rig may be fused under a corrected model, or refuse the session.
 
-    What concerns all views is asked before single ones, since it makes good views look wrong: a hand-eye of another
-    set-up, stock (returned alone: the caller takes it off and asks again), mistakes of the table of poses.
+    What concerns all views is tested before single views, since it makes good ones look wrong: a hand-eye of another
+    set-up; stock; mistakes of the table of poses. Stock is returned alone: the caller takes it off and calls again.
 
     Args:
         measurement: of the session.
@@ -232,6 +240,9 @@ def _misplaced_views(
 ) -> tuple[ExcludedView, ...]:
     """Return the views that are left out, each with the reason.
 
+    Args:
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+
     Raises:
         NoResultError: the views are groups that share no surface.
     """
@@ -253,7 +264,10 @@ def _excluded_view(session: SessionData, v: int, why: str, poses: Array) -> Excl
 
 
 def screen_targets(session: SessionData, targets: TargetModelFit) -> ViewScreening:
-    """Screen labelled points: outliers are taken out one by one; poses that contradict them all are refused.
+    """Return the warnings about a session's labelled points; no view is left out.
+
+    Poses that scatter beyond any arm are checked for mistakes, and refused if one is certain. Single outliers were
+    taken out by the fit.
 
     Raises:
         InputError: a usual mistake explains it.
@@ -283,7 +297,10 @@ def session_warnings(
 
 
 def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:
-    """Return what the tests say of the views of session `index` of a rig, less what is no larger than arms repeat."""
+    """Return what the tests say about the views of session `index` of a rig.
+
+    In sessions of `MAX_VIEWS_WITH_EFFECTS` views or more, only steps beyond what any arm does are kept.
+    """
     announce("checking every view against the others")
     snooping = snoop_views(
         correction.captures[index],
@@ -293,7 +310,7 @@ def _snoop_session(session: SessionData, measurement: Measurement, correction: C
         UsualEffects(measurement, correction.geometry),
     )
     if len(session.views) >= MAX_VIEWS_WITH_EFFECTS:
-        # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
+        # There steps were tested against white scatter alone, and errors that follow the pose look like steps.
         large = [step for step in snooping.steps if beyond_any_arm(session, *step.at_least)]
         snooping = replace(snooping, steps=tuple(large))
     return apply_displacement_limits(session, snooping)
