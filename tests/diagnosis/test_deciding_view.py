@@ -96,15 +96,14 @@ def test_what_is_believed_of_a_rival_makes_it_harder_to_name_and_the_other_no_ea
 
 
 @pytest.fixture(scope="module")
-def cell(library_of):
+def cell():
     """A cell with an uneven gear: what its first views tell, and further ones that were taken."""
     scene = clean("blade", rays=60)
     plan, rail = plan_for(scene, 3, VIEWS + FURTHER)
     measured = simulate(scene, {"gear_eccentricity": 1.5}, 3, planned=(plan, rail))
     session = session_of(measured)
     run = stitch.run(replace(session, views=session.views[:VIEWS]))
-    with library_of(("joint_offset", "gear_eccentricity", "gear_harmonic", "joint_compliance", "backlash")):
-        return stitch.diagnose(run), measured, plan, run
+    return stitch.diagnose(run), measured, plan, run
 
 
 def rivals_of(found):
