@@ -36,10 +36,10 @@ class Regime:
 
 
 def regime_of(linear: LinearModel) -> Regime:
-    """Return how a session is diagnosed: the one switch between few views, many views and labelled points.
+    """Return how a session is diagnosed: few views of clouds, many views, or labelled points.
 
-    Its switches are two: whether pose errors have a prior, as those of fewer than 100 views of scans do, and how many
-    reduced observations there are, which says how well variances are known and how long a fit takes.
+    Three facts decide: whether pose errors have a prior, as with fewer than 100 views of clouds, the number of views,
+    and that of reduced observations. The last says how well variances are known, and how long a fit takes.
     """
     prior = linear.pose_errors is not None
     observations = linear.mixed.size

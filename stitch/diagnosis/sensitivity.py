@@ -32,9 +32,10 @@ _SHAPE_VIEWS, _SHAPE_POINTS = 5, 300
 
 
 def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
-    """Return (K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
+    """Return the alias matrix (K, K) of K effects: correlation, 0 … 1, of row k's pattern with the column's best one.
 
-    The other effect may use all its parameters, but none beyond ten times its plausible size.
+    The pattern is that of the fitted effect in the whitened observations, hand-eye and model projected out. The other
+    effect imitates it with all its parameters, none beyond ten times its plausible size.
     """
     patterns = []
     for scored in scores:
@@ -57,14 +58,23 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
 def aliases_of(
     k: int, matrix: Array, scores: Sequence[Score], least: float = limits.LISTED_ALIAS_CORRELATION
 ) -> dict[str, float]:
-    """Return the effects most similar to candidate k, and the correlation of its fitted pattern with the best that each
-    can do, largest first."""
+    """Return up to five effects that look most like candidate k, with their correlation, largest first.
+
+    Args:
+        matrix: (K, K) alias matrix (`alias_matrix`).
+        scores: of the K candidates, in its order.
+        least: correlation from which an effect is listed.
+    """
     alike = [j for j in np.argsort(-matrix[k]) if j != k and matrix[k, j] > least]
     return {scores[j].name: float(matrix[k, j]) for j in alike[:5]}
 
 
 def imitated_share(y: Array, X: Array) -> float:
-    """Return the share of a pattern (n,) that columns (n, p) of plausible size imitate, 0 … 1."""
+    """Return the correlation, 0 … 1, of a pattern y (n,) with its best imitation by columns X (n, p).
+
+    The imitation is X (XᵀX + 0.01 I)⁻¹ Xᵀ y, columns scaled to plausible sizes: the ridge keeps coefficients below ten.
+    0 for a pattern of zeros, and where there are no columns.
+    """
     length = float(np.linalg.norm(y))
     if length == 0 or not X.size:
         return 0.0
@@ -76,10 +86,14 @@ def imitated_share(y: Array, X: Array) -> float:
 
 
 def hand_eye_response(linear: LinearModel) -> Array:
-    """Return (3, n) how whitened numbers (n,) displace the middle of the scanner's field through the fitted
-    hand-eye."""
+    """Return a matrix (3, n): whitened observations (n,) to the displacement that they cause by the fitted hand-eye.
+
+    The displacement is that of the middle of what the scanner sees, scanner frame, length_unit. With the whitened
+    design X it is [−skew(middle), I] times the first six rows of X⁺.
+    """
     middle = np.mean([points.mean(axis=0) for points in linear.measurement.capture.point_sets], axis=0)
     lever = np.hstack([-frames.skew(middle), np.eye(3)])
+    # Columns of unit length: the pseudoinverse's threshold then treats all parameters alike.
     length = np.linalg.norm(linear.white_design, axis=0)
     scale = np.where(length > 0, length, 1.0)
     return lever @ (np.linalg.pinv(linear.white_design / scale, rcond=1e-10) / scale[:, None])[:6]
@@ -88,13 +102,15 @@ def hand_eye_response(linear: LinearModel) -> Array:
 def omitted_effect_bias(
     linear: LinearModel, response: Array, candidate: Candidate, detectable: dict[str, float]
 ) -> float | None:
-    """Return the largest displacement (length_unit) of the middle of the scanner's field by the error of the hand-eye.
+    """Return how far an effect that is left out of the model could displace the scanned points, length_unit.
 
-    Each parameter in turn is there unseen, at its smallest detectable size or, where that is larger, at its plausible
-    one; the hand-eye takes up of it what generalised least squares gives it. None if these views show no parameter.
+    Each parameter in turn is assumed at its smallest detectable size, but at most at its plausible one, and the
+    hand-eye takes up of it what generalised least squares gives. The largest displacement of the middle of the
+    scanner's field counts. None if these views cannot detect any parameter.
 
     Args:
-        response: of the same linear model (`hand_eye_response`).
+        response: (3, n) of the same linear model (`hand_eye_response`).
+        detectable: smallest detectable size by parameter (`detectable_sizes`).
     """
     displacements = []
     for form in candidate.forms:
@@ -105,13 +121,14 @@ def omitted_effect_bias(
 
 
 def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: dict[str, float]) -> float | None:
-    """Return how far an effect of the scanner may bend the measured shape without showing: rms along normals.
+    """Return how far an effect of the points may bend the scanned surface without showing: rms along normals.
 
-    Scans that err alike agree, and their error becomes the surface. What a motion of each view does too is no shape.
-    In length_unit, of the parameter that bends it most; None for effects of poses, and without scans.
+    Scans with the same error agree, and the error becomes the surface. A rigid motion of each view is no bend, and is
+    projected out. The result, length_unit, is that of the parameter that bends most. None for effects of poses, for
+    empirical shapes, and without clouds.
 
     Args:
-        detectable: by parameter the smallest size that these views show; where they show none, its plausible size.
+        detectable: smallest detectable size by parameter; where there is none, the plausible size stands in.
     """
     measurement = linear.measurement
     term = candidate.forms[0].term
@@ -142,14 +159,17 @@ def least_noncentrality(
     degrees_of_freedom: float,
     scales: Mapping[float, float],
 ) -> float:
-    """Return θᵀIθ that a form needs to be detected.
+    """Return the least noncentrality λ = θᵀIθ at which an effect is detected with probability `POWER`.
+
+    θ are the true parameters, I their information. The F statistic has to pass a limit: that of the p-value or that of
+    the Bayes factor, whichever is larger. inf where the columns show nothing, or where the limit is out of reach.
 
     Args:
         white: (n, p) whitened columns at their plausible sizes.
-        weight: share of the candidate's prior that the form has.
+        weight: share of the candidate's prior that this form has.
         tests: number of candidates.
-        degrees_of_freedom: degrees of freedom of the scatter along the columns.
-        scales: of the plausible sizes, with their shares.
+        degrees_of_freedom: of the scatter along the columns.
+        scales: multiples of the plausible sizes that the prior allows, with their shares.
     """
     information = np.linalg.eigvalsh(white.T @ white)
     rank = int((information > 1e-2).sum())
@@ -166,6 +186,7 @@ def least_noncentrality(
         return float("inf")
 
     def missed(shift: float) -> float:
+        """Return the power at noncentrality `shift` less the one that is needed; negative where it is too little."""
         return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - limits.POWER
 
     # From below: the series of the distribution fails for shifts far beyond what is needed.
@@ -176,11 +197,15 @@ def least_noncentrality(
 
 
 def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -> float:
-    """Return the squared length of the projection at which a form gains that log Bayes factor beside what it could have
-    been.
+    """Return the squared length q of the whitened projection at which a form reaches a log Bayes factor.
+
+    With information k_i, log BF = s · ½ ν log(1 + q/ν) − ½ Σ log(1 + k_i), which is solved for q. The prior shrinks the
+    fit: s (`kept`) is the share that is left, the mean of k_i / (1 + k_i) weighted by k_i.
 
     Args:
-        information: (p,) of its parameters per unit of their prior; where it is little, the prior keeps back a share.
+        factor: log Bayes factor.
+        information: (p,) eigenvalues, parameters in units of their prior's sigma.
+        degrees_of_freedom: ν of the scatter.
     """
     kept = float(np.sum(information**2 / (1 + information)) / max(float(information.sum()), 1e-300))
     charged = (factor + 0.5 * float(np.log1p(information).sum())) / max(kept, 1e-3)
@@ -188,8 +213,14 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
 
 
 def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
-    """Return the smallest detectable size of every free parameter of a candidate among so many, where it alone is not
-    zero, by the form that shows it best."""
+    """Return the smallest detectable size by parameter of a candidate, if that parameter alone is not zero.
+
+    It is √(λ/I), with the least noncentrality λ and the parameter's information I. Of several forms the one counts that
+    shows it best. The candidate's own random effects are taken out of the model first.
+
+    Args:
+        tests: number of candidates among which one would be named.
+    """
     linear = linear.without([candidate.name])
     sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
     scatter, scales = linear.satterthwaite, regime_of(linear).scales

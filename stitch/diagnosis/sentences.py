@@ -29,10 +29,10 @@ _CAUSES = (
 
 
 def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
-    """Return what was found, how much is left, where it comes from and what to do.
+    """Return a diagnosis as sentences in one text: what was found, how much is left, its source, what to do.
 
     Args:
-        pair: two effects that are missing, each beside the other; the first is the one that is named.
+        pair: two missing effects, each scored with the other in the model, the named one first; None: not two.
     """
     match d.verdict:
         case "adequate":
@@ -47,6 +47,7 @@ def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranke
 
 
 def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    """Yield the sentences on an adequate model: scatter of the poses, the scanner's error, what could hide."""
     yield f"The model is adequate. {_residual_sentence(d, length_unit)}"
     if d.rotation > 0 or d.translation > 0:
         scatter = _scatter(d.translation, d.rotation, length_unit)
@@ -66,6 +67,7 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 
 def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> Iterator[str]:
+    """Yield the sentences on one missing effect, and on a second one where there is a `pair`."""
     candidate = next(c for c in d.candidates if c.name == d.effects[0])
     ranked = pair[0] if pair else candidate.ranked
     is_missing = "is missing" if d.certain else "may be missing"
@@ -88,7 +90,14 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
 
 
 def _what_looks_the_same(d: Diagnosis, name: str) -> str:
-    """Say which other place would move whole views as an effect does; nothing where there is none."""
+    """Return a sentence that a moving base of the robot looks the same as the named effect; "" where it does not.
+
+    The base cannot be told from whatever stands still beside it: the scanner's stand (eye_to_hand) or the part's
+    fixture (eye_in_hand).
+
+    Args:
+        name: of the effect; of one scanner of several it ends in @SCANNER.
+    """
     of_all = name.partition("@")[0]
     place = EFFECTS[of_all].place if of_all in EFFECTS else ""
     if place not in ("mount", "part") or d.linear.measurement.eye_to_hand != (place == "mount"):
@@ -98,7 +107,10 @@ def _what_looks_the_same(d: Diagnosis, name: str) -> str:
 
 
 def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
-    """Say why another effect is named than the one that explains most alone, which stands first in the table."""
+    """Yield why the named effect is not the one that explains most alone; nothing where it is that one.
+
+    `candidates` are ordered by what each explains alone. `effects` are named, `together` are missing side by side.
+    """
     first = d.candidates[0]
     named = d.effects[0]
     if first.name == named:
@@ -114,6 +126,7 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    """Yield the sentences on effects that these views cannot tell apart."""
     is_missing = "is missing" if d.certain else "may be missing"
     yield f"Something {is_missing}: {' or '.join([*d.effects, *unnamed_in_words(d)])}. These views cannot tell which."
     yield _step_like_what_lasts(d)
@@ -124,7 +137,10 @@ def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 
 def _step_like_what_lasts(d: Diagnosis) -> str:
-    """Say from which view on an effect of a group that begins there does what another does in all views."""
+    """Return a sentence on an event of the group that looks like a lasting effect of it; "" where there is none.
+
+    An event early in the session, such as a slip, displaces nearly all views as a constant error would.
+    """
     group = [c for c in d.candidates if c.name in d.effects]
     for begins in group:
         view = next((p.view for p in begins.ranked.score.form.term.parameters if p.discrete), None)
@@ -135,6 +151,7 @@ def _step_like_what_lasts(d: Diagnosis) -> str:
 
 
 def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    """Yield the sentences on an error without a name: laws, scanner, covariates, places, poses, untested effects."""
     yield f"No effect of the library explains what is left. {_residual_sentence(d, length_unit)}"
     yield from _laws_found(d)
     if d.overlap_misfit:
@@ -162,7 +179,7 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 
 def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
-    """Say what the poses do where nothing is named."""
+    """Yield sentences on the pose errors where nothing is named: whether they repeat, and how much they scatter."""
     scatter = _scatter(d.translation, d.rotation, length_unit)
     if errors := reportable(d.repeating_errors, d.implausible):
         size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
@@ -185,7 +202,7 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 
 def _allowed(d: Diagnosis, length_unit: str) -> str:
-    """Say by how much poses may scatter."""
+    """Return a sentence on the expected scatter of the poses: as stated, or else that of ordinary arms."""
     limits = _scatter(d.expected_scatter.translation, d.expected_scatter.rotation, length_unit)
     if d.expected_scatter.stated:
         return f"The stated repeatability allows {limits}."
@@ -199,9 +216,9 @@ def unnamed_in_words(d: Diagnosis) -> list[str]:
 
 
 def law_in_words(law: Law) -> str:
-    """Return a law as people call it: joint 5 follows ambient_c (a line).
+    """Return a law in words: joint 5 follows ambient_c (a line).
 
-    A number of periods a turn is told only where the driven range holds a whole one.
+    Where the joint's range is too short for one whole period, no number of periods per turn is stated.
     """
     joint = re.fullmatch(r"j(\d+)_deg", law.driver.covariate)
     if joint is None:
@@ -214,7 +231,7 @@ def law_in_words(law: Law) -> str:
 
 
 def _laws_found(d: Diagnosis) -> Iterator[str]:
-    """Say which laws of the dictionary do, with their sizes, and what to do."""
+    """Yield sentences on the laws of the dictionary that explain the rest, with sizes and advice; nothing without."""
     if not d.laws:
         return
     told = [f"{law_in_words(law_of(r))}, by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
@@ -250,8 +267,11 @@ def _listed(names: Sequence[str], last: str) -> str:
 
 
 def scanner_error_sentence(error: FieldError, length_unit: str) -> str:
-    """Return what the scans err by: the clearer of the two kinds, the same in every view or every view's own, with its
-    size; how much views err by themselves besides is uncertain."""
+    """Return a sentence on the scanner's smooth error with its rms, by its kind.
+
+    It is the same in every view, or each scan's own, whichever is clearer. If it is the former, that views also differ
+    is said without a size, which is uncertain.
+    """
     drift = ", larger as the session goes on" if error.with_time else ""
     if error.by_view:
         return f"Each scan has a smooth error of its own{drift}: {length_text(error.rms_by_view, length_unit, 2)} rms."
@@ -261,7 +281,11 @@ def scanner_error_sentence(error: FieldError, length_unit: str) -> str:
 
 
 def scanner_advice(error: FieldError | None, length_unit: str) -> Iterable[str]:
-    """Return what the scans err by where nothing else is named, and what to do; None: only the poses show it."""
+    """Return sentences on the scanner's error where nothing else is named, and what to do about it.
+
+    Args:
+        error: of the scanner; None: it is inferred from the poses alone, and has no size.
+    """
     if error is not None and error.by_view:
         return (
             scanner_error_sentence(error, length_unit),
@@ -274,7 +298,7 @@ def scanner_advice(error: FieldError | None, length_unit: str) -> Iterable[str]:
 
 
 def curve_sentences(d: Diagnosis, length_unit: str) -> list[str]:
-    """Return a sentence for every trend without a name that is clear enough, of joints and in time."""
+    """Return sentences on trends without a name: of up to `_MAX_CURVES` joints, what these follow, and in time."""
     shown = d.curves[:_MAX_CURVES]
     sentences = [joint_curve_sentence(curve) for curve in shown]
     undecided = {curve.joint: curve.may_follow for curve in shown if len(curve.may_follow) > 1}
@@ -286,7 +310,7 @@ def curve_sentences(d: Diagnosis, length_unit: str) -> list[str]:
 
 
 def joint_curve_sentence(curve: JointCurve) -> str:
-    """Return where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
+    """Return a sentence with the least and the largest error of a joint, and where in its range they are."""
     low, high = (
         f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad "
         f"{_place_in_words(curve, i)}"
@@ -297,8 +321,7 @@ def joint_curve_sentence(curve: JointCurve) -> str:
 
 
 def _place_in_words(curve: JointCurve, k: int) -> str:
-    """Return at j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each
-    kg."""
+    """Return point k of a curve in words by the kind of its covariate: at j4 = -48°, after a move of 12°, at view 7."""
     place = curve.at[k]
     name = curve.covariate
     match name.split("_", 1)[-1]:
@@ -315,7 +338,7 @@ def _place_in_words(curve: JointCurve, k: int) -> str:
 
 
 def time_curve_sentence(curve: TimeCurve, length_unit: str) -> str:
-    """Return how far a flange seems to be off in time, and what could name the cause."""
+    """Return sentences on the largest motion and turn of the flange in time, and how to find the cause."""
 
     def when(k: int) -> str:
         steps = curve.steps[k] - curve.steps[0]
@@ -338,9 +361,14 @@ def odds_text(log_odds: float) -> str:
 
 
 def posterior_text(verdict: str, named: Sequence[str], posteriors: dict[str, float], effect: str) -> str:
-    """Return the probability of an effect; of one that these views cannot tell from others that of all together.
+    """Return the posterior of an effect as text; for a member of an undecided group that of the whole group.
 
-    How it is shared among those is a judgement of how often each is met, which did not decide.
+    Within a group only the prior of how common each effect is would divide it, and that did not decide.
+
+    Args:
+        verdict: of the diagnosis.
+        named: the effects that it names.
+        posteriors: by effect.
     """
     if verdict != "cannot_tell" or effect not in named:
         return f"{posteriors[effect]:.2f}"
@@ -349,7 +377,11 @@ def posterior_text(verdict: str, named: Sequence[str], posteriors: dict[str, flo
 
 
 def fitted_amounts(ranked: Ranked, at_most: int = 3) -> str:
-    """Return the clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
+    """Return the parameters of the best form as text, c2 = 0.44 ± 0.04 µrad/(N m): gridded ones, then the clearest.
+
+    Args:
+        at_most: number of fitted parameters; those with the most sigmas are taken.
+    """
     scored = ranked.score
     if not scored.fitted:
         return "too small to be worth a fit"

@@ -83,14 +83,18 @@ class FittedProcess:
 
 
 def joint_motions(linear: LinearModel) -> Array:
-    """Return (n, V, 6, 1) twists of the views by a radian of each joint."""
+    """Return twists (n, V, 6, 1) of the V views per radian of each of n joints, about the part's centre."""
     offset = term_of(linear.measurement, EFFECTS["joint_offset"])
     return next(pose_derivatives(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
 
 
 def single_joint_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
-    """Yield joint k, counted from 0, that follows all joints, its own angle closely, or its own and the one that it
-    comes from."""
+    """Yield processes of one joint: smooth in all joint angles, in its own, or in its own now and in the view before.
+
+    Args:
+        motions: (n, V, 6, 1) twists of the views per radian of each joint.
+        k: the joint, counted from 0.
+    """
     views = linear.measurement.views
     angle = views.joints[:, [k]]
     before = views.previous[:, [k]]
@@ -99,7 +103,12 @@ def single_joint_processes(linear: LinearModel, motions: Array, k: int) -> Itera
 
 
 def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
-    """Yield joint k, counted from 0, that follows its own angle and that of one other."""
+    """Yield processes of one joint that are smooth in its own angle and that of another one, for each other joint.
+
+    Args:
+        motions: (n, V, 6, 1) twists of the views per radian of each joint.
+        k: the joint, counted from 0.
+    """
     joints = linear.measurement.views.joints
     for other in range(joints.shape[1]):
         if other != k:
@@ -107,7 +116,7 @@ def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterato
 
 
 def wandering_flange(linear: LinearModel) -> SmoothProcess:
-    """Return a flange that wanders in time."""
+    """Return the process of a flange that wanders in time, with an exponential covariance between views."""
     measurement = linear.measurement
     time = time_in_steps(measurement)
     knots = _knots(len(time))
@@ -117,9 +126,17 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
 
 
 def leading_trends(covariance: Array, most: int) -> Array:
-    """Return (K, R) of which the trends with unit coefficients of a process are made, by its covariance with the knots
-    (K, K)."""
-    # What is smooth is a product of few columns: theirs are its trends, found in a third of the time.
+    """Return coefficients (K, R) of the leading trends of a process: covariance with the knots (·, K) times these.
+
+    The trends have independent coefficients of unit variance. With eigenvalues d and eigenvectors E of the covariance
+    they are E d^(−½), so that K E d^(−½) has the covariance K at the knots (Nyström's method).
+
+    Args:
+        covariance: (K, K) between K knots, chosen views.
+        most: largest number R; small eigenvalues are left out.
+    """
+    # A smooth covariance has low rank: by pivoted Cholesky, root rootᵀ, the eigenproblem is smaller and three times as
+    # fast.
     factor, order, rank, _ = dpstrf(covariance, lower=1, tol=_ROUNDING * covariance.diagonal().max())
     root = np.zeros((len(covariance), rank))
     root[order - 1] = np.tril(factor[:, :rank])
@@ -149,12 +166,14 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> tuple[float, fl
 
 
 def fit_process(linear: LinearModel, process: SmoothProcess, first_size: float, tried: int) -> FittedProcess:
-    """Return the process with all variances fitted anew: what it explains is no scatter, and where the scatter is less
-    it is likelier of another size.
+    """Return a process fitted together with all variances, at the better of two sizes.
+
+    What the process explains is no scatter. With less scatter another size may be likelier: it is sought once more at
+    the variances of the first fit.
 
     Args:
         first_size: the likeliest at the null's variances (`size_process`).
-        tried: processes among which it was chosen.
+        tried: number of processes among which it was chosen; its logarithm is taken off the log Bayes factor.
     """
     columns = process.columns(linear)
     G = linear.in_blocks(columns)

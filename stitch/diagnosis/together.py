@@ -62,7 +62,14 @@ class Together:
 
 
 def decide_together(linears: Sequence[LinearModel]) -> Together:
-    """Return which effect of their arm several sessions show, each linearised about a model without it."""
+    """Return which effect of their common arm several sessions show.
+
+    A name needs odds of 20 to 1 over each alternative: nothing missing, another effect or law with separate values in
+    every session, and a smooth error without a name. Effects within 20 to 1 of the best form a group.
+
+    Args:
+        linears: the sessions, each linearised about a model without the effect.
+    """
     tried = [candidates_of(linear, empirical=False)[0] for linear in linears]
     ranked = [rank_all(linear, candidates)[0] for linear, candidates in zip(linears, tried, strict=True)]
     by_name = [{r.name: r for r in of_session} for of_session in ranked]
@@ -71,7 +78,7 @@ def decide_together(linears: Sequence[LinearModel]) -> Together:
     scores = {name: [of_session[name].score for of_session in by_name] for name in names}
     otherwise = _each_its_own(linears, tried, scores)
     shared = [_shared(linears, of, len(names)) for of in scores.values() if _is_shared(of[0].candidate)]
-    # Numbers of its own in every session are no rival of the same effect: its name holds.
+    # The same effect with separate values in every session is no rival: the name would be the same.
     own = {s.name: otherwise.pop(s.name) for s in shared}
     shared = [
         s if np.isinf(s.log_posterior) else replace(s, log_posterior=max(s.log_posterior, own[s.name])) for s in shared
@@ -92,7 +99,7 @@ def decide_together(linears: Sequence[LinearModel]) -> Together:
 
 
 def together_sentence(together: Together) -> str:
-    """Return what the sessions say, by what it was decided."""
+    """Return the decision of several sessions as a clause, by the verdict, with the odds of a name."""
     match together.verdict:
         case "adequate":
             return "they show no effect of their arm."
@@ -110,7 +117,7 @@ def together_sentence(together: Together) -> str:
 
 
 def together_document(together: Together, sessions: Sequence[str]) -> dict[str, Any]:
-    """Return what several sessions say together, as `--json` has it."""
+    """Return the decision of several sessions as `stitch diagnose --json` prints it."""
     return {
         "format": "stitch-together/1",
         "sessions": list(sessions),
@@ -133,13 +140,16 @@ def _is_shared(candidate: Candidate) -> bool:
 
 
 def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int) -> Shared:
-    """Return one effect fitted with common parameters to all sessions, and the log Bayes factor of that.
+    """Return one effect fitted with common parameters to all sessions, with its log Bayes factor.
 
-    Each session tells information and vector of the parameters at the scatter that the effect leaves there; they add.
+    Session s gives the information I_s = Xᵀ C⁻¹ X and the vector b_s = Xᵀ C⁻¹ y of the parameters, at the variances
+    that the effect leaves there. Both are added over the sessions: the estimate is (Σ I_s)⁻¹ Σ b_s. The change of each
+    session's likelihood by these variances is added to the log Bayes factor. An effect whose known load should show and
+    does not has a log Bayes factor of −inf.
 
     Args:
-        scores: of the effect, by session.
-        tests: effects among which it was chosen.
+        scores: of the effect, one a session.
+        tests: number of effects among which it was chosen.
     """
     parts = []
     for linear, scored in zip(linears, scores, strict=True):
@@ -151,6 +161,7 @@ def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int)
         whole = scored.candidate.forms[0]
         ((information, vector),) = at.information([whole.selected])
         parts.append((whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance)))
+    # Sessions may have different free parameters: all of them are numbered.
     known = {p.name: p for free, *_ in parts for p in free}
     number = {name: k for k, name in enumerate(known)}
     total, towards = np.zeros((len(known), len(known))), np.zeros(len(known))
@@ -176,7 +187,10 @@ def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int)
 
 
 def _fitted(free: Sequence[Parameter], information: Array, vector: Array) -> tuple[Parameter, ...]:
-    """Return parameters with values and sigmas; what is not seen is of usual size."""
+    """Return the free parameters with values and sigmas, by information (p, p) and vector (p,).
+
+    A prior of `FREE_SIZES` plausible sizes keeps parameters that the sessions do not show finite.
+    """
     sizes = np.array([p.typical for p in free])
     covariance = np.linalg.inv(information + np.diag((limits.FREE_SIZES * sizes) ** -2.0))
     values, sigmas = covariance @ vector, np.sqrt(np.diag(covariance))
@@ -186,7 +200,15 @@ def _fitted(free: Sequence[Parameter], information: Array, vector: Array) -> tup
 def _each_its_own(
     linears: Sequence[LinearModel], tried: Sequence[Sequence[Candidate]], scores: dict[str, list[Score]]
 ) -> dict[str, float]:
-    """Return the log posteriors of effects and laws of which every session has numbers of its own."""
+    """Return log posteriors of the alternatives with separate parameters in every session, by name of effect or law.
+
+    Evidence adds over the sessions; the prior counts once. Laws that an effect of the library implies are left out, and
+    those that one of the sessions does not have.
+
+    Args:
+        tried: candidates of each session.
+        scores: of each effect, one a session.
+    """
     log_posteriors = dict[str, float]()
     for name, of in scores.items():
         prior = float(np.log(limits.PRIOR_PHYSICAL * of[0].candidate.effect.prior / len(scores)))
@@ -204,9 +226,11 @@ def _each_its_own(
 
 
 def _grows_with_load(parameters: Sequence[Parameter]) -> bool:
-    """Return False where a known load that bends an arm as usual would be seen, and bends nothing.
+    """Return False where a known load should bend the arm visibly, but its coefficients are not above zero.
 
-    The masses of links are parts of their coefficients: without a load gravity is any curve.
+    A coefficient per known load has no mass in its unit. Those of the links' weight, in units with kg, contain unknown
+    masses, and can imitate any curve; so they prove nothing. True where the load's effect would be too small to see, and
+    where no mass is unknown.
     """
     known = [p for p in parameters if not p.unit.startswith("kg ")]
     if len(known) == len(parameters):

@@ -84,8 +84,11 @@ class Evidence:
 
     @property
     def told_laws(self) -> tuple[Ranked, ...]:
-        """Laws that are told: beside what is named those that explain as much; else what stands out, with all within
-        20 to 1, unless these are too many to help."""
+        """Laws of the dictionary that are reported.
+
+        If something is named, they are its rivals. Otherwise they are the best law, if it stands out, and all within
+        20 to 1 of it; more than `MOST_LAWS` would help nobody, and none is reported.
+        """
         if self.named:
             return self.rival_laws
         if self.verdict != "unknown_effect" or not self.laws or not stands_out(self.laws[0]):
@@ -96,7 +99,10 @@ class Evidence:
 
     @property
     def told_places(self) -> tuple[str, ...]:
-        """Where something acts that too many laws describe alike to tell any: all places within 20 to 1, if few."""
+        """Places of the laws within 20 to 1 of the best, where these laws are too many to be reported themselves.
+
+        () if there are also too many places.
+        """
         if self.verdict != "unknown_effect" or self.told_laws or not self.laws or not stands_out(self.laws[0]):
             return ()
         least = self.laws[0].log_posterior - limits.ODDS
@@ -121,9 +127,10 @@ class Evidence:
 
 
 def scanner_explains_it(evidence: Evidence) -> bool:
-    """Return whether smooth errors of the scans gain at least as many nats as the effect that would be named.
+    """Return whether smooth errors of the scans explain at least as much as the one effect that would be named.
 
-    Poses found from scans that err are off too, and an effect that explains some of that is not thereby there.
+    Both are log Bayes factors, in nats. Errors of scans also displace poses found from them, so that an effect of the
+    poses may only imitate them.
     """
     return (
         evidence.scanner_error is not None
