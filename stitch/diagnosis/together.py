@@ -229,8 +229,8 @@ def _grows_with_load(parameters: Sequence[Parameter]) -> bool:
     """Return False where a known load should bend the arm visibly, but its coefficients are not above zero.
 
     A coefficient per known load has no mass in its unit. Those of the links' weight, in units with kg, contain unknown
-    masses, and can imitate any curve; so they prove nothing. True where the load's effect would be too small to see, and
-    where no mass is unknown.
+    masses, and can imitate any curve; so they prove nothing. True also where the load's effect would be too small to
+    see, and where no mass is unknown.
     """
     known = [p for p in parameters if not p.unit.startswith("kg ")]
     if len(known) == len(parameters):
