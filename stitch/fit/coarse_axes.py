@@ -170,7 +170,9 @@ class _Motions:
         return tuple(axes), frames.make(R_mount, x[:3])
 
     def _shifted(self, directions: Array, x: Array) -> Array:
-        """Return T_reference_mount (V, 4, 4) for K axes at given places.
+        """Return T_reference_mount (V, 4, 4) for K axes: A_left⁻¹ · A_right · T_base_flange, or its inverse.
+
+        Each axis is a factor A of A_left or A_right (`Axes.stands_right`). The inverse is for a part in hand.
 
         Args:
             directions: (K, 3) of the rotary axes.

@@ -253,9 +253,10 @@ def next_gates(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> lis
 
 
 def with_noise_factor(capture: Capture, scatter: Repeatability) -> Capture:
-    """Return the capture with clouds that weigh beside its labelled points by the scatter that they have shown.
+    """Return the capture with the noise factor that was found, by which clouds are weighted against labelled points.
 
-    Correspondences share points and normals, so that they never know more than as many independent distances.
+    It is 1 at least, as for independent distances: correspondences share points and normals, and tell no more than
+    these. A capture without labelled points is unchanged.
     """
     return capture if capture.sightings is None else replace(capture, noise_factor=max(scatter.noise_factor, 1.0))
 

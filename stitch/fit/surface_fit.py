@@ -183,6 +183,9 @@ class LinearisedSurfaces:
 
         Sources are the scanner, each effect whose parameters are left at zero though they may not be, and the
         uncertainty of another run's arm.
+
+        Args:
+            choice: parameters that are fitted; the rms (P,) that those left at zero may have; the scanner's errors.
         """
         _, omitted, scanner_errors = choice
         terms = self.model.terms
@@ -191,6 +194,7 @@ class LinearisedSurfaces:
             sizes = omitted * (self._effect_of_parameter == k)
             if sizes.any():
                 errors[unfitted(term.name)] = [c[:, sizes > 0] * sizes[sizes > 0] for c in self.columns]
+        # (P, K) root of the covariance of parameters that come from another run's arm.
         kept = kept_root(terms, self.model.effects_covariance)
         errors[ANOTHER_ARM] = [c @ kept for c in self.columns]
         return errors

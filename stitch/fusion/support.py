@@ -215,7 +215,10 @@ class _LocalSurface:
     """The surface that k neighbours of N points span: votes, mean normal, height over the points, scatter, bend."""
 
     def __init__(self, around: Array, normals: Array, vote: Array) -> None:
-        """Fit N surfaces to k neighbours each.
+        """Fit N surfaces to k neighbours each; all results are (N,) but the mean `normal` (N, 3).
+
+        `votes`: sum of the votes of neighbours whose normals agree; `height`: median height of their tangent planes
+        over the point; `scatter`: robust sigma of these heights; `bend`: median angle (rad) between normals.
 
         Args:
             around: (N, k, 3) neighbours from the point.

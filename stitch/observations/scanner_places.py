@@ -118,7 +118,7 @@ def scanner_places(
 
 
 def contradictions(places: tuple[ScannerPlace, ...], length_unit: str) -> tuple[str, ...]:
-    """Return a doubt of each scanner whose own views put it elsewhere than all together do."""
+    """Return a warning for each scanner whose own views place it elsewhere than the views of all do, beyond its U."""
     return tuple(
         f"scanner {p.name} contradicts the others: its own views put it {length_text(p.apart, length_unit)} away where "
         f"U (k = {COVERAGE_FACTOR:g}) is {length_text(p.U_alone, length_unit, 2)}; to fix: check that part, arm and "

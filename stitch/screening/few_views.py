@@ -51,14 +51,16 @@ class FewViews:
 def weigh_few_views(
     measurement: Measurement, hand_eye: Model, unconstrained: UnconstrainedPoses, model: ViewModel
 ) -> FewViews:
-    """Return the odds that one of few views is off, against what ordinary arms leave.
+    """Return the odds that one of few views is off its pose, against ordinary errors of an arm: a Bayes factor.
 
-    Each view is displaced in turn, by several sizes, and the evidence of the poses with that is held against their
-    evidence without: under usual errors of the arm, scatter, and errors of the scanner, whose sizes are integrated.
+    Numerator: the mean, over views and sizes of a displacement, of the marginal likelihood with this view displaced.
+    Denominator: the same without any displacement. Both integrate over the sizes of the arm's errors and of white
+    scatter; the scanner's errors have fixed sizes.
 
     Args:
-        hand_eye: with effects in use; the arm errs beside these.
-        model: of what the unconstrained views say.
+        hand_eye: hand-eye and effects in use, about which the errors of the arm are linearised.
+        unconstrained: the views moved by the overlaps alone.
+        model: linear model of what these say about the poses.
     """
     errors = prior_pose_errors([measurement], hand_eye, [model.centre]).of_ordinary_arm.project(model.reduced.reduction)
     usual = errors.scales[:, None, None] ** 2 * errors.components

@@ -436,11 +436,13 @@ def _row_mistakes(
     T = stated_hypothesis(session).T_base_flange
     count = len(T)
     yield stated.undone("reversed", T[::-1][rows])
+    # File names may count from 0 or from 1.
     for first in (0, 1):
         as_text = np.argsort([str(v + first) for v in range(count)])
         yield stated.undone("text order", T[as_text][rows], sorted="clouds", others="poses")
         yield stated.undone("text order", T[np.argsort(as_text)][rows], sorted="poses", others="clouds")
     for shift in (shift for shift in _SHIFTS if abs(shift) < count - 2):
+        # Scans at the end of the list have no pose left.
         used = np.flatnonzero((rows + shift >= 0) & (rows + shift < count))
         named = f"{abs(shift)} row{'s' * (abs(shift) > 1)}"
         where = "below" if shift > 0 else "above"

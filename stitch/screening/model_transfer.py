@@ -112,10 +112,10 @@ def _transfer_warnings(session: SessionData, applied: FittedSession, fitted: Fit
 
 
 def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) -> str | None:
-    """Return a sentence on what lies elsewhere than in the other run, the hand-eye or targets, and what to do.
+    """Return a sentence that hand-eye or targets have moved since the other run, and what to do; None if neither has.
 
-    None where a fit of both here leaves no less than chance would, or neither has moved beyond what both runs know it
-    to.
+    Moved means two things: fitted here, they leave significantly smaller residuals; and they differ from the other
+    run's by more than the covariances of both allow.
 
     Args:
         there: the views of this session under the model of the other run.

@@ -225,7 +225,8 @@ def starts_about(T: Array, scan: Scan, size: float) -> Array:
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
     """Return the closure (share of near points that lie on the surface) from which a scan counts as placed.
 
-    It is `_ACCEPTED_CLOSURE` of the median closure of some linked views at their poses; of 1 where none is unlinked.
+    It is `_ACCEPTED_CLOSURE` times the median closure of some linked views at their poses. Where all views are linked,
+    or hardly any, it is `_ACCEPTED_CLOSURE` itself.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner.

@@ -50,10 +50,16 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
     """
 
     def closes(points: Array, eye: Array, reach: float) -> bool:
-        """Return whether points close with the surface of the others within `reach` (length_unit) of their pose."""
+        """Return whether a cloud lies on the surface of the others at its pose, or placed within `reach` of it.
+
+        Args:
+            points, eye: (N, 3) points of the changed cloud and (3,) place that it was seen from, scanner frame.
+            reach: largest shift from its pose, length_unit.
+        """
         other = prepare_scan(scan.name, points, eye=eye)
         placed = place_scan(other, surface, starts_about(T_pose, other, size), size)[0]
         placements = (evaluate_placement(other, T_pose, surface), placed)
+        # Where less than a third of the scan is near the surface, its closure says little.
         near = [p for p in placements if p.near > 0.3 and _moved(other, T_pose, p.T) < reach]
         return max((p.closure for p in near), default=0.0) > needed
 

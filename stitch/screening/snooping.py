@@ -100,7 +100,10 @@ class Snooping(PlacedViews):
 
     @property
     def alone(self) -> tuple[int, ...]:
-        """Single views that no surface links to the others, which are most; none where groups stand apart."""
+        """Views that no surface links to the others, if all are single views and the others are the majority; else ().
+
+        Otherwise the session falls into groups, of which nobody can say which one is right.
+        """
         if not self.disconnected:
             return ()
         most, *others = self.disconnected

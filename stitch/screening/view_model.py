@@ -351,20 +351,20 @@ def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Arra
         normal: N (k, k).
         estimate: (k,).
     """
-    held, axes = np.linalg.eigh(normal)
-    held = np.maximum(held, 0.0)
-    seen = axes.T @ estimate
-    if held @ seen**2 <= limit:
-        return np.zeros(len(seen))
+    eigenvalues, axes = np.linalg.eigh(normal)
+    eigenvalues = np.maximum(eigenvalues, 0.0)
+    along_axes = axes.T @ estimate
+    if eigenvalues @ along_axes**2 <= limit:
+        return np.zeros(len(along_axes))
 
-    def missed(log_pull: float) -> float:
-        """Return by how much the quadratic form exceeds the limit under a ridge penalty p, given as its logarithm."""
-        pull = np.exp(log_pull)
-        return float(held @ (pull / (held + pull) * seen) ** 2 - limit)
+    def excess(log_penalty: float) -> float:
+        """Return by how much the quadratic form exceeds the limit under a penalty p, given as its logarithm."""
+        penalty = np.exp(log_penalty)
+        return float(eigenvalues @ (penalty / (eigenvalues + penalty) * along_axes) ** 2 - limit)
 
-    strongest = np.log(held[-1])
-    pull = np.exp(brentq(missed, strongest - 60, strongest + 60))
-    return axes @ (held / (held + pull) * seen)
+    strongest = np.log(eigenvalues[-1])
+    penalty = np.exp(brentq(excess, strongest - 60, strongest + 60))
+    return axes @ (eigenvalues / (eigenvalues + penalty) * along_axes)
 
 
 @dataclass(frozen=True)

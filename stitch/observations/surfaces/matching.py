@@ -225,6 +225,7 @@ def match_pairs(
             nearest = queries.nearest(w, points, gate)
             partner = nearest.partner
         else:
+            # Only the queries whose nearest point may have changed are searched.
             nearest = before.nearest[w]
             partner = nearest.partner.copy()
             partner[again[w]] = queries.partners(w, points.take(again[w], axis=0), gate)
@@ -237,6 +238,7 @@ def match_pairs(
         if both:
             columns = zip(*(match.columns for match in both), strict=True)
             matches.append(Match(v, w, *(np.concatenate(column) for column in columns)))
+    # A search of some queries is no new `before`: its leads are still those under the poses of the last full search.
     if before is None or again is None:
         # Points and normals under these poses are not needed again: the next search has its own.
         lean = replace(queries, poses=np.array(poses), points=[], normals=[])

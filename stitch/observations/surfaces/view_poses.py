@@ -136,16 +136,18 @@ def solve_views(g: Gram, pair_vectors: Array) -> Array:
 def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
     """Return H⁺b (6V, K): twists of the views that solve the normal equations, for K right-hand sides given by view.
 
+    H⁺ = S V Λ⁻¹ Vᵀ S, with the scale S of twists, and eigenvectors V and eigenvalues Λ of the directions seen.
+
     Args:
         by_surfaces: (6V, K) part of b by the overlaps of surfaces.
         by_targets: (6V, K) part of b by labelled points.
     """
     seen = g.visible
-    scale, vectors, by_normals = seen.scale[:, None], seen.vectors, seen.of_surfaces
+    scale, vectors, surface_basis = seen.scale[:, None], seen.vectors, seen.of_surfaces
     b = scale * by_surfaces
     if g.labelled.any():
         # Where surfaces see nothing, their part is noise of normals: there only that of the targets counts.
-        b = scale * by_targets + by_normals @ (by_normals.T @ b)
+        b = scale * by_targets + surface_basis @ (surface_basis.T @ b)
     return scale * (vectors @ ((vectors.T @ b) / seen.values[:, None]))
 
 

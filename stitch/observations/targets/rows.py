@@ -66,11 +66,11 @@ class Landmarks:
         return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
 
     def updated(self, by: Array) -> "Landmarks":
-        """Return the landmarks after a step of all their unknowns, in this order.
+        """Return the landmarks after a step of all their unknowns.
 
         Args:
-            by: (U,) shifts of the targets; left rotation vector of the probe, if it is held; left twist of the drawing,
-                if there is one.
+            by: (U,) in this order: translations of the K targets (3K), length_unit; left rotation vector (3) of the
+                probe, if there is one, rad; left twist (6) of the drawing, if there is one.
         """
         at = self.positions.size
         positions = self.positions + by[:at].reshape(-1, 3)
