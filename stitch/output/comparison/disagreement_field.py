@@ -49,12 +49,12 @@ class DisagreementField:
 
     @cached_property
     def overall(self) -> Array:
-        """Return (K,) mean of |value| over the views that see a patch; NaN where they are fewer than two."""
+        """(K,) mean of |value| over the views that see a patch, length_unit; NaN where they are fewer than two."""
         return _mean_over_views(np.abs(self.values))
 
     @cached_property
     def by_view(self) -> Array:
-        """Return (V,) mean of |value| over the patches that a view sees; NaN where it sees none with others."""
+        """(V,) mean of |value| over the patches that a view sees, length_unit; NaN where it shares none with others."""
         seen = np.isfinite(self.values)
         count = seen.sum(axis=1)
         return np.where(count > 0, np.where(seen, np.abs(self.values), 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
@@ -72,14 +72,17 @@ class DisagreementField:
         return _MEAN_OF_NORMAL * float(np.nanmean(_mean_over_views(self.sigma)))
 
     def quantile(self, share: float = 0.95) -> float:
-        """Return the distance that this share of the part keeps."""
+        """Return the quantile of `overall` over the patches, length_unit: `share` of the part disagrees by less."""
         seen = self.overall[np.isfinite(self.overall)]
         return float(np.quantile(seen, share)) if len(seen) else float("nan")
 
 
 def full_colour_distance(field: DisagreementField, session: SessionData) -> float:
-    """Return the distance at which colours are full: what a usual arm leaves is pale, and steps of the colours are no
-    smaller than nearly all standard errors."""
+    """Return the distance at which the colour scale ends, length_unit.
+
+    It is the largest of three: the 95 % quantile of the field, `COLOUR_STEPS` standard errors, so that a step of colour
+    is no noise, and `_PALE` times the scatter of a usual or stated arm, which is so drawn pale.
+    """
     stated = session.repeatability.sigma_translation
     usual = _USUAL_ARM / (METRES[session.length_unit] * 1e3) if stated is None else stated
     return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma), _PALE * usual)
@@ -91,7 +94,7 @@ def largest_standard_error(sigma: Array) -> float:
 
 
 def _mean_over_views(values: Array) -> Array:
-    """Return (K,) over the views (V, K) that see a patch; NaN where they are fewer than two."""
+    """Return the means (K,) of values (V, K) over the views with a finite value; NaN where they are fewer than two."""
     seen = np.isfinite(values)
     count = seen.sum(axis=0)
     return np.where(count > 1, np.where(seen, values, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
@@ -100,14 +103,15 @@ def _mean_over_views(values: Array) -> Array:
 def patches_of(matches: Sequence[Match], views: int, scale: float, model_distances: Array) -> "Patches":
     """Return patches over the surface that the matches cover, as small as the noise allows.
 
-    The radius grows until the standard errors are below one step of the colours, whose range is what nearly all of the
-    field keeps; the largest radius is taken where they never are, the present one where no patch tells its error.
+    The radii `_RADII`, shares of the part's longest side, are tried in growing order. The first is taken whose standard
+    errors are below one step of colour: the 95 % quantile of |field| over `COLOUR_STEPS`. If no patch has a standard
+    error, a larger radius does not help, and the present one is taken. If no radius is enough, it is the last.
 
     Args:
-        matches: of all overlapping pairs, with the views where they agree best: what scatters there is noise.
-        views: their number V.
-        scale: robust sigma of the distances, length_unit; what lies beyond the gate of the rms is an edge.
-        model_distances: (M,) distances under the model whose field the colours are to show, length_unit.
+        matches: M correspondences of all overlapping pairs, at the registered poses: distances there are noise.
+        views: number V of views.
+        scale: robust sigma of the distances, length_unit; those beyond `RMS_GATE` times it are edges and are dropped.
+        model_distances: (M,) distances under the model whose field is to be drawn, length_unit.
     """
     pairs = _Correspondences(matches, views, scale)
     # Of all points but a hundredth: single ones far off would make the part longer.
@@ -124,7 +128,13 @@ class _Correspondences:
     """The R correspondences of M whose distance is inside the robust gate, at the poses of the matches."""
 
     def __init__(self, matches: Sequence[Match], views: int, scale: float) -> None:
-        """Take matches of V `views` apart, in their order; `scale` is the robust sigma of their distances."""
+        """Join the arrays of all matches, in their order.
+
+        Args:
+            matches: M correspondences, v less w.
+            views: number V of views.
+            scale: robust sigma of the distances, length_unit.
+        """
         self.views = views
         self.distances = np.concatenate([m.residual for m in matches])  # (M,)
         self.inside: Mask = np.abs(self.distances) < RMS_GATE * scale  # (M,)
@@ -142,7 +152,12 @@ class Patches:
     """K patches of one radius on the part, and which correspondences belong to them, with which weight."""
 
     def __init__(self, pairs: _Correspondences, radius: float) -> None:
-        """Group the correspondences into C cells, these into K patches, and weigh each cell for each patch."""
+        """Group the correspondences into C cells, and these into K patches; weigh each cell for each patch.
+
+        Args:
+            pairs: the R correspondences.
+            radius: standard deviation of the weights, length_unit.
+        """
         cell, centre, facing = _group_points(pairs.middle, pairs.normal, pairs.side, _CELL * radius)
         self._inside = pairs.inside
         self._cell_of = np.concatenate([cell, cell]) * pairs.views + pairs.view
@@ -167,10 +182,14 @@ class Patches:
         return sums.reshape(self._counts.shape).astype(float)
 
     def _standard_errors(self, quiet: Array) -> Array:
-        """Return standard errors (V, K) of each view's mean in each patch, by the scatter of the cells about it.
+        """Return standard errors (V, K) of each view's mean in each patch, by the scatter of the cells' means about it.
 
-        That is Σ a²(m − d)², a the weights. Neighbouring distances share points and normals; cells are wide enough not
-        to.
+        With weights a of the cells (kernel times counts), means m of the cells and d of the patch, the variance is
+        Σ a² (m − d)² / (Σ a)² · N/(N − 1); N = (Σ a)²/Σ a² is the effective number of cells. Neighbouring distances
+        are correlated, since they share points; cells are wide enough to be independent.
+
+        Args:
+            quiet: (M,) distances at the registered poses, length_unit.
         """
         kernel, n = self._kernel, self._counts
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -186,7 +205,14 @@ class Patches:
 
 
 def _kernel(place: Array, outwards: Array, centre: Array, facing: Array, radius: float) -> csr_matrix:
-    """Return (K, C) Gaussian weights of the cells about every place that face the same way."""
+    """Return Gaussian weights (K, C) of C cells for K patches; zero for cells far away or on another side of the part.
+
+    Args:
+        place, outwards: (K, 3) centres of the patches and their unit normals.
+        centre, facing: (C, 3) those of the cells.
+        radius: standard deviation of the weights, length_unit.
+    """
+    # No more cells than this lie within the reach on a surface.
     near = min(len(centre), int(4 * (_REACH / _CELL) ** 2))
     distance, index = KDTree(centre).query(place, k=near, distance_upper_bound=_REACH * radius)
     distance = distance.reshape(len(place), -1)
@@ -200,17 +226,21 @@ def _kernel(place: Array, outwards: Array, centre: Array, facing: Array, radius:
 
 
 def _facing_side(normals: Array) -> Indices:
-    """Return (N,) which of the six sides of a cube normals (3, N) face most."""
+    """Return for normals (3, N) the number (N,), 0 … 5, of the cube's side that each faces most."""
     axis = np.abs(normals).argmax(axis=0)
     return 2 * axis + (normals[axis, np.arange(len(axis))] > 0)
 
 
 def _group_points(points: Array, normals: Array, side: Indices, size: float) -> tuple[Indices, Array, Array]:
-    """Return the group of every point, and per group mean point and unit normal; both sides of a sheet differ.
+    """Group points by the cells of a cubic grid and by the side that they face; the two faces of a sheet stay apart.
 
     Args:
         points, normals: (3, N).
-        side: (N,) that the normals face.
+        side: (N,) number of the side of a cube that each normal faces (`_facing_side`).
+        size: edge of a cell, in the unit of the points.
+
+    Returns:
+        Group (N,) of every point; and for G groups mean points (G, 3) and unit normals (G, 3).
     """
     index = np.floor((points - points.min(axis=1, keepdims=True)) / size).astype(np.int64)
     key = np.ravel_multi_index((*index, side), (*(index.max(axis=1) + 1), 6))

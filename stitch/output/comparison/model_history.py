@@ -54,9 +54,10 @@ class TargetStep:
 
 @remembered
 def model_history(run: RunData) -> ModelHistory | None:
-    """Return the field of disagreement at every step of a run's history; None without clouds.
+    """Return the field of disagreement at every step: coarse, each model of the ledger, register; None without clouds.
 
-    Steps whose effects are not known any more are left out.
+    All steps share correspondences and patches, chosen for the first corrected model. Steps with an effect that is not
+    in the library any more are left out.
     """
     if run.registered is None:
         return None
@@ -71,10 +72,10 @@ def model_history(run: RunData) -> ModelHistory | None:
 
 
 def target_history(run: RunData) -> tuple[TargetStep, ...]:
-    """Return how far the targets lie off their place at every step; empty where none were seen.
+    """Return how far the targets lie from their positions at every step; empty where none were seen.
 
-    All steps have the same sightings, those that count now. The model in use is the last but one. Steps whose effects
-    are not known any more are left out.
+    All steps use the sightings that count now. The present model is the last but one step, with its fitted positions;
+    in the others a target's position is its mean over the views. Steps with unknown effects are left out.
     """
     sightings = run.measurement.capture.sightings
     if run.targets is None or sightings is None:
@@ -92,7 +93,12 @@ def target_history(run: RunData) -> tuple[TargetStep, ...]:
 
 
 def _target_step(name: str, sightings: Sightings, places: Array) -> TargetStep:
-    """Return one step: targets (V, S, 3) as the views place them, each about the middle of all views."""
+    """Return a step with the distance of every sighting from the mean position of its target.
+
+    Args:
+        sightings: which target each slot of a view shows, and whether it counts.
+        places: (V, S, 3) positions by view and slot, reference frame, length_unit.
+    """
     distances = np.full(sightings.used.shape, np.nan)
     for k in range(len(sightings.targets)):
         seen = sightings.used & (sightings.target == k)
@@ -102,7 +108,10 @@ def _target_step(name: str, sightings: Sightings, places: Array) -> TargetStep:
 
 
 def models_of(run: RunData) -> list[tuple[str, Model]]:
-    """Return name of the step and model: coarse, each line of the ledger, the present one as the last."""
+    """Return (name, model) of every step: the coarse hand-eye, each step of the ledger, the present model as the last.
+
+    Steps with an effect that is not in the library any more are left out.
+    """
     models = [(COARSE, Model(run.T_mount_coarse))]
     for i, step in enumerate(run.ledger[:-1]):
         if (model := _model_of(step, run.measurement)) is not None:
@@ -112,7 +121,10 @@ def models_of(run: RunData) -> list[tuple[str, Model]]:
 
 
 def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
-    """Return the model of a step of the ledger; None where one of its effects is not known here any more."""
+    """Return the model of a step of the ledger; None where one of its effects is not in the library any more.
+
+    A parameter that the step does not state, as of an older version, is zero.
+    """
     if any(name.partition("@")[0] not in EFFECTS or name not in step.values for name in step.effects):
         return None
     terms = []
@@ -127,7 +139,7 @@ def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
 
 
 def effect_changes(ledger: Sequence[LedgerStep], i: int) -> str:
-    """Return what step i added or dropped: + joint_compliance."""
+    """Return what step i of a ledger added and dropped, as "+ joint_compliance, − backlash"; first, its effects."""
     if i == 0:
         return ", ".join(ledger[0].effects) or HAND_EYE_ONLY
     before = ledger[i - 1].effects

@@ -70,7 +70,7 @@ class Witness:
         }
 
     def sentences(self, length_unit: str) -> list[str]:
-        """Return what an auditor reads, one fact a sentence."""
+        """Return sentences for an auditor: how Open3D registered the scans, and how far it is from the run."""
         here = _summary(self.to_run)
         there = _summary(self.from_run)
         worst = int(np.argmax(self.shift))
@@ -88,10 +88,9 @@ class Witness:
         ]
 
     def _nearer_sentences(self, length_unit: str) -> Iterator[str]:
-        """Say by whose poses the surfaces of two views meet more closely.
+        """Yield sentences on whose poses bring the surfaces of two views closer, by a sign test over the overlaps.
 
-        Both were fitted to these surfaces, with six numbers a view against thousands of points: who is nearer by that
-        is not told here.
+        The number of fitted parameters is not corrected for: both fits have six a view, against thousands of points.
         """
         count = len(self.overlaps)
         if not count:
@@ -116,9 +115,9 @@ def _summary(distance: Array) -> dict[str, float]:
 
 
 def open3d_witness(run: RunData) -> Witness:
-    """Compute the poses of a run's views by Open3D: pairs by robust point-to-plane ICP, then a graph of poses.
+    """Return the poses of a run's views by Open3D, compared with the run's: robust point-to-plane ICP, a pose graph.
 
-    Bits repeat: it works on one thread.
+    One thread computes, so that results repeat to the last bit.
 
     Raises:
         InputError: Open3D is not installed, or lacks a library of the system.
@@ -157,7 +156,7 @@ def open3d_witness(run: RunData) -> Witness:
 
 @contextmanager
 def _one_thread(o3d: Any) -> Iterator[None]:
-    """Keep Open3D to one thread, where it can be kept so, and to errors."""
+    """Limit Open3D to one thread, where its version allows that, and to messages of errors while the block lasts."""
     limit = getattr(o3d.utility, "set_max_threads", lambda _: None)
     limit(1)
     try:
@@ -168,7 +167,10 @@ def _one_thread(o3d: Any) -> Iterator[None]:
 
 
 def _spacing(clouds: list[Array]) -> float:
-    """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
+    """Return the mean spacing of the clouds' points, the edge s of the square of surface per point, in their unit.
+
+    The disc of radius r to the 8th neighbour holds 8 squares: s = r √(π/8).
+    """
     rows = [np.ascontiguousarray(points, float) for points in clouds]
     far = [np.median(KDTree(points).query(points[::20], k=9)[0][:, -1]) for points in rows]
     return float(np.median(far) * np.sqrt(np.pi / 8))
@@ -186,7 +188,16 @@ def _with_normals(o3d: Any, clouds: list[Array]) -> list[Any]:
 
 
 def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> tuple[Array, int]:
-    """Return T_reference_scanner (V, 4, 4) and the number of pairs that were registered."""
+    """Return poses T_reference_scanner (V, 4, 4) by Open3D, and the number of pairs of views that it registered.
+
+    Args:
+        clouds: V clouds (N, 3), scanner frame, length_unit.
+        start: (V, 4, 4) poses at which it begins.
+        spacing: of the points, length_unit.
+
+    Raises:
+        NoResultError: a view is in no pair.
+    """
     registration = o3d.pipelines.registration
     shown = _with_normals(o3d, clouds)
     graph = registration.PoseGraph()
@@ -220,7 +231,7 @@ def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> 
 
 
 def _one_sided(clouds: list[Array], poses: Array) -> list[tuple[int, int]]:
-    """Return the pairs of views that look at the part from the same side."""
+    """Return the pairs of views whose directions to the part's middle are within 60° of each other."""
     looks = [frames.rotate(T, c.mean(axis=0)[None])[0] for c, T in zip(clouds, poses, strict=True)]
     unit = [look / np.linalg.norm(look) for look in looks]
     return [(i, j) for i, j in combinations(range(len(clouds)), 2) if unit[i] @ unit[j] > _SAME_SIDE]
@@ -232,9 +243,14 @@ def _placed(clouds: list[Array], poses: Array) -> Array:
 
 
 def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Array], reach: float) -> Array:
-    """Return (P, 2): for each overlap of two views, how far its points lie from the other's surface by either poses.
+    """Return median distances (P, 2) between the surfaces of each of P overlapping pairs, by either set of poses.
 
-    Counted are the points that have a partner within `reach` by both.
+    Only points count that have a partner within reach by both sets.
+
+    Args:
+        clouds, normals: of V views, (N, 3) each, scanner frame.
+        rivals: the two sets of poses (V, 4, 4).
+        reach: length_unit.
     """
     trees = [KDTree(np.ascontiguousarray(points, float)) for points in clouds]
     medians = []
@@ -254,6 +270,10 @@ def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Ar
 
 
 def _from_surface(points: Array, surface: Array, normals: Array) -> Array:
-    """Return the distance (N,) of points from the tangent plane of the nearest surface point."""
+    """Return signed distances (N,) of points (N, 3) from the tangent plane of the nearest surface point.
+
+    Args:
+        surface, normals: (M, 3) points and their unit normals; positive distances lie on the normals' side.
+    """
     _, at = KDTree(np.ascontiguousarray(surface, float)).query(np.ascontiguousarray(points, float))
     return np.einsum("ni,ni->n", points - surface[at], normals[at])

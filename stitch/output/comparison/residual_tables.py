@@ -162,17 +162,17 @@ class ResidualTables(Table, document="stitch.output.comparison.residual_tables:c
 
     @cached_property
     def means(self) -> int:
-        """Return how many means of bins are tested.
+        """Number of different means of bins that are tested, for Bonferroni's correction.
 
-        Bins of the same rows count once in whichever table they stand, and so do a bin and all that lies outside it:
-        the sums of the two differ in their sign alone.
+        Bins with the same rows count once, recognised by equal |sums|. A bin and its complement count once too: all
+        rows together sum to zero, so that their sums differ in sign only.
         """
         sums = [np.abs(t.mean * t.count)[np.isfinite(t.p_value)] for t in self.places]
         ordered = np.sort(np.concatenate(sums)) if sums else np.zeros(0)
         return len(ordered) and 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
 
     def p_of_all(self, table: ResidualTable) -> float:
-        """Return the p-value of the clearest mean of a table, over all means (Bonferroni).
+        """Return the p-value of a table's clearest mean, times the number of all means (Bonferroni).
 
         Example:
             >>> tables = stitch.compare(run)
@@ -237,7 +237,12 @@ def compare_targets(state: RunData) -> ResidualTables:
 
 
 def _comparison(state: RunData, tables: Sequence[ResidualTable], rms: float, known: Properties) -> ResidualTables:
-    """Return tables with what is known of the views, and what the displacements of whole views follow of it."""
+    """Return the result of a comparison: tables that are not empty, and on what the views' displacements depend.
+
+    Args:
+        rms: of all residuals, length_unit.
+        known: properties of the views.
+    """
     with library_threads_off():
         followed = dependences(linearise(state.session, state.measurement, state.model, state.gate))
     return ResidualTables(
@@ -266,7 +271,11 @@ def _of_rows(known: Properties, view: Indices) -> Properties:
 
 
 def property_varies(name: str, values: Array) -> bool:
-    """Return True if a property (V,) has two values; that no view came before the first is no approach."""
+    """Return True if a property (V,) has two different values; the 0 of a direction of approach is none.
+
+    Args:
+        name: of the property.
+    """
     known = values[values != 0] if name.startswith(APPROACH) else values
     return bool(len(known) and np.ptp(known) > _SAME_VALUE)
 
@@ -274,7 +283,12 @@ def property_varies(name: str, values: Array) -> bool:
 def _binned_tables(
     properties: Properties, statistics: Callable[[Indices, int], BinStatistics]
 ) -> Iterable[ResidualTable]:
-    """Return a table for each property of rows (N,) that takes more than one bin."""
+    """Yield a table for each property of rows (N,) that takes more than one bin.
+
+    Args:
+        properties: name, unit and values (N,).
+        statistics: function from bins (N,) and their number to the statistics of each bin.
+    """
     for name, unit, values in properties:
         edges, bins = equal_count_bins(values)
         if len(edges) > 2:
@@ -309,12 +323,20 @@ def _labelled_table(name: str, labels: Sequence[str], statistics: BinStatistics)
 
 
 class _CorrespondenceRows:
-    """Both sides of every correspondence inside the robust gate."""
+    """Rows of residuals: two for every correspondence inside the robust gate, one as seen from either view.
+
+    N rows have `view` and `partner` (N,), `residual` (N,) length_unit, positive where the view lies outside its
+    partner, `place` (N, 3) in the reference frame, and `properties` of the view's point in the scanner frame.
+    """
 
     def __init__(self, state: RunData, poses: Array, matches: Sequence[Match], scale: float) -> None:
-        """Take apart the matches of V views at poses (V, 4, 4); `scale` is the robust sigma of their distances.
+        """Make two rows of each correspondence: of v with partner w, and of w with partner v and the other sign.
 
-        Each correspondence has two rows: of v with partner w, and of w with partner v and the other sign.
+        Args:
+            state: the run.
+            poses: (V, 4, 4) T_reference_scanner.
+            matches: correspondences at these poses.
+            scale: robust sigma of their distances, length_unit.
         """
         self.count = len(poses)
         parts: list[list[Array]] = [[], [], [], [], [], []]
@@ -353,10 +375,13 @@ class _CorrespondenceRows:
 
 
 class _OffsetRows:
-    """Labelled points in views: where a view puts each, less where hand-eye and effects put it best."""
+    """Rows of labelled points: offset (N, 3) of each sighting from the target's fitted position, reference frame.
+
+    `view` and `target` (N,) say whose it is, `points` (N, 3) where it was seen, sensor frame; length_unit.
+    """
 
     def __init__(self, state: RunData) -> None:
-        """Fit the places of the targets under the model of a run, and take what is left as offsets."""
+        """Fit the positions of the targets under the model of a run, weighted least squares; offsets are what is left."""
         capture = corrected_capture(state.measurement, state.model)
         sightings = capture.sightings
         assert sightings is not None
@@ -376,7 +401,14 @@ class _OffsetRows:
         self.points = sightings.points[self.view, slot]  # sensor frame
 
     def statistics(self, bins: Indices, size: int) -> BinStatistics:
-        """Return what the views say of the means of so many bins, along the direction in which these differ most."""
+        """Return the statistics of bins: means of offsets along the direction in which the bins differ most.
+
+        That is the first principal direction of the bins' means. rms is that of the 3D offsets.
+
+        Args:
+            bins: (N,) bin of each row.
+            size: number of bins.
+        """
         count = np.bincount(bins, minlength=size)
         sums = np.stack([np.bincount(bins, self.offset[:, i], size) for i in range(3)], axis=1)
         mean = sums / np.maximum(count, 1)[:, None]
@@ -389,14 +421,18 @@ class _OffsetRows:
 
 
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
-    """Return the table of views; each is one sample, so that nothing says how well its mean is known (NaN)."""
+    """Return the table of views by name; sigmas and p-values are NaN, since each bin is a single sample, its view."""
     table = _labelled_table("view", names, rows.statistics(rows.view, len(names)))
     nothing = np.full(len(names), np.nan)
     return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
 
 
 def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
-    """Return the table of pairs of views that have correspondences; a pair is one sample, without a sigma (NaN)."""
+    """Return the table of pairs of views that have correspondences: mean and rms of the distance, length_unit.
+
+    Sigmas and p-values are NaN, since a pair is a single sample. `rows.sums` are (1, V, V); both halves hold the same
+    correspondences, and the upper one counts v less w.
+    """
     one_bin = np.zeros(len(rows.view), np.int64)
     counts, sums, squares = (by_bin[0] for by_bin in rows.sums(one_bin, 1))
     v, w = np.nonzero(np.triu(counts, 1))
@@ -415,7 +451,10 @@ def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
 
 
 def _place_table(rows: _CorrespondenceRows) -> ResidualTable:
-    """Return the table of cells of the part along the axes of the reference frame."""
+    """Return the table of cells of the part, a grid along the axes of the reference frame; labels are their centres.
+
+    The grid spans all but the outermost 1 % of the points, which fall into the cells at the rim.
+    """
     low, high = np.quantile(rows.place, [0.005, 0.995], axis=0)
     cell = np.clip(((rows.place - low) / np.maximum(high - low, 1e-12) * _PLACES).astype(np.int64), 0, _PLACES - 1)
     number = (cell[:, 0] * _PLACES + cell[:, 1]) * _PLACES + cell[:, 2]
@@ -463,15 +502,15 @@ def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, direction
 
 
 def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
-    """Return the variance between views (B,) and its degrees of freedom (B,).
+    """Return the variance between views (B,) and its degrees of freedom (B,), pooled over two groups of views.
 
-    A bin of one or two views does not know it. Pooled with the views of the bin about their mean are the views that
-    do not lie in it, with the values of all their rows, about theirs.
+    The groups are the views in the bin, by their mean there, and those outside, by their mean over all rows. Each is
+    taken about its own mean: a bin of one or two views alone would not know the variance.
 
     Args:
-        values: (B, V) of the views in the bins.
-        whole: (V,) of all rows of the views.
-        use: (B, V) where a view makes a sample.
+        values: (B, V) means of the views in the bins.
+        whole: (V,) means over all rows of the views.
+        use: (B, V) where a view has enough rows in a bin.
     """
     others = use.any(axis=0) & ~use
     square = np.zeros(len(use))
@@ -486,7 +525,15 @@ def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]
 
 
 def _mean_p_value(z: float, freedom: float, directions: int) -> float:
-    """Return P of a mean so many sigmas from zero by chance, in the worst direction; Student's t for one direction."""
+    """Return the p-value of a mean z sigmas from zero along the clearest of several directions; NaN for z of NaN.
+
+    By Scheffé, z² (ν − d + 1) / (d ν) is F distributed with d and ν − d + 1 degrees of freedom: Student's t for d = 1.
+
+    Args:
+        z: |mean| over its standard error.
+        freedom: degrees of freedom ν of that error.
+        directions: number d of dimensions.
+    """
     left = freedom - directions + 1
     if not np.isfinite(z):
         return float("nan")
@@ -535,7 +582,10 @@ def comparison_document(comparison: ResidualTables) -> dict[str, object]:
 
 
 def _table_row(comparison: ResidualTables, table: ResidualTable) -> dict[str, object]:
-    """Return a table as JSON has it, with the p-value of its clearest mean and the tables that have the same bins."""
+    """Return a table as a row of compare.json.
+
+    A table of a property also has the p-value of its clearest mean and the names of tables with the same bins.
+    """
     row = {"name": table.name, "unit": table.unit, "label": list(table.label), "clearest": table.clearest}
     if not table.label:
         group = next(group for group in comparison.groups if any(x is table for x in group))

@@ -36,7 +36,7 @@ def shorten_doubts(verdict: str, doubts: Sequence[str]) -> str:
 
 
 def run_verdict(run: RunData, history: ModelHistory | None) -> str:
-    """Return for everybody what is wrong with the session, how far its views disagree, and what effects brought.
+    """Return the verdict on a run in plain sentences: doubts, disagreement of the views, what effects brought.
 
     Args:
         history: of this run; None without clouds.
@@ -47,9 +47,9 @@ def run_verdict(run: RunData, history: ModelHistory | None) -> str:
 
 
 def prediction_text(run: RunData) -> str:
-    """Return what was predicted of the last change of the model and what came, with a word where they differ.
+    """Return a sentence on the error predicted for the last change of the model, and the one that came of it.
 
-    They differ where a tenth of the predicted gain lies between them. Empty where nothing was predicted.
+    They count as different if they differ by more than a tenth of the predicted gain. "" where nothing was predicted.
     """
     if len(run.ledger) < 2 or not np.isfinite(run.ledger[-1].predicted):
         return ""
@@ -63,7 +63,7 @@ def prediction_text(run: RunData) -> str:
 
 
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:
-    """Return how far the views disagree on the part, what effects brought, and what the stitched cloud keeps."""
+    """Return sentences on the views' mean disagreement: with and without effects, and after register."""
 
     def mean_text(step: ModelStep) -> str:
         return length_text(step.field.mean_abs, length_unit, 2)
@@ -81,7 +81,7 @@ def plain_verdict(history: ModelHistory, length_unit: str) -> str:
 
 
 def _added_effects(changes: Sequence[str]) -> list[str]:
-    """Return effects that the steps of a history brought and none took away again: + a, then − a, + b brought b."""
+    """Return the effects that were added and not dropped again, by texts of changes: "+ a", "− a, + b" gives b."""
     effects: list[str] = []
     for change in ", ".join(changes).split(", "):
         name = change[2:]
@@ -93,7 +93,7 @@ def _added_effects(changes: Sequence[str]) -> list[str]:
 
 
 def _target_agreement(run: RunData) -> str:
-    """Return how far labelled points lie off their place, and what effects brought."""
+    """Return a sentence on the rms distance of labelled points from their positions, and what effects brought."""
     unit = run.session.length_unit
     if run.targets is not None and run.targets.uninformative:
         return "Each target is seen in one view alone, so the views cannot disagree."
@@ -109,9 +109,9 @@ def _target_agreement(run: RunData) -> str:
 
 
 def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> ToleranceVerdict | None:
-    """Return whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
+    """Return whether 95 % of the part, or of the sightings of targets, agree within a tolerance (length_unit).
 
-    None where neither surfaces nor targets say anything of it.
+    None where neither surfaces nor targets are seen by several views.
     """
     unit = run.session.length_unit
     if history is not None:
@@ -127,7 +127,10 @@ def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> T
 
 
 def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -> ToleranceVerdict:
-    """Return whether 95 % of the part agree within a tolerance (length_unit), stitched and under the model."""
+    """Return whether 95 % of the part agree within a tolerance (length_unit): "good", "check" or "bad".
+
+    good: under the model alone; check: only in the stitched cloud, with a correction of each view; bad: neither.
+    """
     model = _reach(history.models[-1])
     cloud = _reach(history.steps[-1])
     allowed = length_text(tolerance, length_unit, 4)

@@ -123,7 +123,7 @@ def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
 
 
 def comparison_sentence(both: TwoRuns) -> str:
-    """Return what changed from A to B, for everybody."""
+    """Return what changed from run A to run B in plain sentences: effects, disagreement of the views, hand-eye."""
     unit = both.a.run.session.length_unit
     error_a, error_b = (length_text(side.error, unit) for side in (both.a, both.b))
     labelled = both.a.history is None
@@ -136,7 +136,11 @@ def comparison_sentence(both: TwoRuns) -> str:
 
 
 def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
-    """Return: With joint_compliance and without backlash in the model."""
+    """Return how the effects of model b differ from those of a: "With backlash and without latency in the model".
+
+    Args:
+        a, b: names of the effects.
+    """
     gained = [effect for effect in b if effect not in a]
     lost = [effect for effect in a if effect not in b]
     parts = [f"with {' and '.join(gained)}"] * bool(gained) + [f"without {' and '.join(lost)}"] * bool(lost)
@@ -145,7 +149,11 @@ def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
 
 
 def _hand_eye_sentence(change: HandEyeChange, length_unit: str, what: str) -> str:
-    """Return how far two hand-eyes put `what` apart, and if their uncertainties explain it; without a full stop."""
+    """Return a sentence, without its full stop, on how far two hand-eyes displace the part, and if chance explains it.
+
+    Args:
+        what: "part" or "targets".
+    """
     if not change.twist.any():
         return "Both have the same hand-eye"
     apart = f"The hand-eyes put the {what} {length_text(change.at_part, length_unit)} apart"
