@@ -271,7 +271,9 @@ def _of_rows(known: Properties, view: Indices) -> Properties:
 
 
 def property_varies(name: str, values: Array) -> bool:
-    """Return True if a property (V,) has two different values; the 0 of a direction of approach is none.
+    """Return True if a property (V,) has two different values.
+
+    A direction of approach is 0 in the first view, which nothing precedes: that is no value.
 
     Args:
         name: of the property.
@@ -381,7 +383,7 @@ class _OffsetRows:
     """
 
     def __init__(self, state: RunData) -> None:
-        """Fit the positions of the targets under the model of a run, weighted least squares; offsets are what is left."""
+        """Fit the positions of the targets under the model of a run by weighted least squares; keep the residuals."""
         capture = corrected_capture(state.measurement, state.model)
         sightings = capture.sightings
         assert sightings is not None
