@@ -5,7 +5,8 @@ FEATURES: a clean cell; a compliance of the joints that is in the model; an arm 
 and link; a scanner with smooth errors over field and incidence, each half as large as its noise; one whose smooth
 errors are new in each scan. All have the small errors that every simulated cell has. SOURCES holds each part of the
 budget against what it truly does. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000
-to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019, 46200 to 46239.
+to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019, 46200 to 46239,
+46300 to 46339, 46400 to 46439.
 
 CERTIFICATES: the hand-eye from one day and the artefact on another, at other poses: clean cells, and arms that are a
 little wrong in every joint and link; all scanners have smooth errors that are new in each scan. The hand-eye of the
