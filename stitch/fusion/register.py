@@ -119,7 +119,7 @@ def register(
         model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
         scatter: sigmas of the flange's poses (the prior), and the factor on the noise within overlaps.
         gate: largest distance between corresponding points at first, length_unit.
-        start: (V, 4, 4) poses to begin with; None: the model's.
+        start: (V, 4, 4) poses to begin with, whose mean motion from the model's is taken out; None: the model's.
         method: how correspondences are weighted.
         before: overlaps at poses near by, whose search is used again; None: all is searched.
 
@@ -153,7 +153,7 @@ def register(
 
 
 def _without_mean_motion(start: Array, model_poses: Array) -> Array:
-    """`start` without its mean motion against the robot, which no overlap can show."""
+    """Return poses `start` (V, 4, 4) without the mean of their motions from the model's, which no overlap can show."""
     common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
     return frames.exp(-common) @ start
 

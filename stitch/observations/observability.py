@@ -168,7 +168,8 @@ def unobservable(
     """
     gains, directions = motion_gain(captures, T_mount, *seen_part(captures, scanner), scanner)
     axes = _named_axes(captures, robot, joints)
-    # How far from the part a joint's axis may stand: the longest way through the cell.
+    # No joint's axis is farther from the part: the largest distance of a scanner from the reference frame, its distance
+    # from the mount, and that of the part from the scanner.
     ways = [np.linalg.norm(frames.inverse(c.poses(T_mount))[:, :3, 3], axis=1).max() for c in captures]
     reach = max(ways) + np.linalg.norm(T_mount[:3, 3]) + np.linalg.norm(seen_part(captures)[0])
     hidden = _split(directions[:, gains < _VISIBLE], float(reach))

@@ -138,8 +138,8 @@ class CommonMove:
     def solved(self, starts: list[int]) -> "CommonMove":
         """Return the move with the least sum of squares among those that begin at one of `starts`, views.
 
-        Each step takes one Gauss–Newton step from every start and keeps the best. It ends, at the latest after
-        `_STEPS`, when neither the view nor the sum changes.
+        Hand-eye and motion begin at those of this move. Each round takes one Gauss–Newton step for every view and keeps
+        the best. It ends when neither the view nor the sum of squares changes, at the latest after `_STEPS` rounds.
         """
         best = self
         for _ in range(_STEPS):

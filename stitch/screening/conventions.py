@@ -288,6 +288,7 @@ def lagging_poses(stated: Hypothesis, motions: RelativeScans) -> Iterator[Hypoth
     T = stated.T_base_flange
     v, w = np.array(motions.pairs).T
     shares = _LAGS
+    # A coarse grid of shares, then a fine one about its best.
     for width in (0.0, _LAGS[1] - _LAGS[0]):
         shares = np.clip(shares + np.linspace(-width, width, len(_LAGS)), 0, _LAGS[-1])
         ahead = _without_lag(T, shares, along_lines=False)

@@ -424,15 +424,18 @@ def _evidence(case: _Case, left: Array, weight: Array) -> float:
 
 
 def _over_torn(case: _Case, rows: Array, e: Array, left: Array, weight: Array) -> float:
-    """Return the log evidence of stock on a region over any motion of the region by itself, as of a torn scan.
+    """Return the log evidence (nats) of stock on a region over a rigid motion of that region alone, as in a torn scan.
 
-    A motion has six numbers where stock has one, and distances show each of them (Schwarz 1978, Ann. Stat. 6:461).
+    It is the gain in log likelihood plus (6 − 1)/2 · log n, for the five parameters that a motion has more (Schwarz
+    1978, Ann. Stat. 6:461). n counts correlated distances as fewer.
 
     Args:
-        rows: (M, 6) change of the region's distances by a motion of it.
-        e: (M,) distances, with the stock.
-        left: (M,) what it leaves of them.
+        rows: (M, 6) change of the region's distances per twist of the region.
+        e: (M,) its distances from the other views, length_unit.
+        left: (M,) residuals of these with stock.
+        weight: (M,) of these.
     """
+    # Residuals with a motion: robust least squares, reweighted from those with stock.
     moved = left
     for _ in range(_TORN_STEPS):
         weighted = rows.T * (weight * tukey(moved, case.sigma))

@@ -237,7 +237,7 @@ def _scanner_covariance(measurement: Measurement, unconstrained: UnconstrainedPo
     """
     errors = [field_scatter(measurement, unconstrained)]
     if measurement.views.scanners:
-        # What one scanner's millimetre differs by from another's shows, and every pair has it.
+        # Every pair of scanners differs in scale, and overlaps of their scans show it.
         errors.append(scale_scatter(measurement, unconstrained))
     columns = reduced.reduction @ np.hstack(errors)
     return (columns @ columns.T)[None]
