@@ -267,8 +267,8 @@ def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Arr
 def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
     """Return the rms over all ordered pairs of views of the distance from points of one to the other, length_unit.
 
-    A distance above `limit`, or to a surface that faces another way, counts as `limit`: a hand-eye under which views do
-    not meet scores no better than one under which they miss.
+    A distance above `limit`, or to a surface that faces another way, counts as `limit`. So a hand-eye that moves views
+    away from each other gains nothing.
     """
     squares: list[float] = []
     for c in captures:

@@ -102,10 +102,11 @@ def support_note(dropped: Unsupported) -> str:
 
 
 def target_sentence(targets: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
-    """Return the residual at the targets, the noise floor, and the scatter of the poses, in sentences.
+    """Return the verdict of a run in sentences: residual at the targets, noise floor, scatter of the poses.
 
     Args:
-        registered: rms after single views were registered, length_unit.
+        registered: rms distance of the targets after each view got its own correction, length_unit.
+        scatter: of the robot's poses.
     """
     floor = targets.noise_floor
     left, out, noise = (length_text(x, length_unit, 4) for x in (targets.rms, targets.heldout_rms, floor))

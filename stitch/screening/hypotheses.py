@@ -349,6 +349,7 @@ def _other_rotations(R: Rotation) -> Iterator[tuple[str, Rotation, dict[str, str
 
     Quaternions with another sign or order, Euler angles of another order, radians read as degrees.
     """
+    # SciPy's order: x, y, z, w.
     q = R.as_quat()
     yield "other way", R.inv(), {}
     yield "w first", Rotation.from_quat(q[:, [1, 2, 3, 0]]), {}

@@ -152,7 +152,12 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
 def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str, float]:
     """Return by name how far (length_unit) targets are from where the other run has them, of those that have moved.
 
-    They have where chance does not explain it: half of `_MODEL_CHANCE` is shared by all targets.
+    A target has moved if a χ² test of three coordinates rejects, by the sigmas of both runs, at half of `_MODEL_CHANCE`
+    over the number of targets (Bonferroni).
+
+    Args:
+        there: the session under the model of the other run.
+        here: with hand-eye and targets fitted to it.
     """
     sigmas = here.landmark_sigmas
     known = {name: k for k, name in enumerate(here.rows.sightings.targets) if name in there.model.targets}

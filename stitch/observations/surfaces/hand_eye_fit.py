@@ -127,6 +127,7 @@ class CaptureEvidence:
         """
         touched = np.isin(self.gram.pairs, views).any(axis=1)
         J = np.column_stack([hand_eye_jacobian(self.hand_eye_frames, self.gram.centre), self.effect_twists])
+        # The correspondences are those of views moved by `twists` from the robot's poses.
         moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
         return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
 
