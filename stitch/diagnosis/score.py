@@ -89,13 +89,13 @@ class FormTrial:
 
 
 def score(linear: LinearModel, candidate: Candidate, start: Array | None = None) -> Score:
-    """Try all forms of a candidate beside everything else that poses may err by.
+    """Return how well a candidate explains the views, by its best form, with all other pose errors as random effects.
 
-    The candidate takes the place of its own share of the pose errors: it is asked for by name, all others remain of
-    whatever size the views give them.
+    The candidate's own random effect is taken out of the model first, since it would explain the same. Forms are rated
+    quickly at fixed variances, and the most promising are fitted with all variances (`try_form`).
 
     Args:
-        start: (c,) variances to begin with; None: those of the null, or where else their maximum may lie.
+        start: (c,) variances at which the fits begin; None: the best of several starts, as there may be local maxima.
     """
     base = linear.without([candidate.name])
     regime = regime_of(base)
@@ -105,11 +105,11 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     observable = any(shown for _, shown in at_starts)
     likely = quick.max(axis=1)
     best_start = quick.argmax(axis=1)
-    # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
+    # Where the scatter has absorbed a gross effect, no plausible size seems observable; yet the effect gains.
     observable = observable or bool(likely.max() > limits.LOG_BAYES_FACTOR)
     least = max(regime.least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
     weights = form_weights(candidate)
-    # What cannot gain is fitted once, for its size.
+    # A candidate that cannot gain is fitted in one form only, to report its size.
     hopeless = regime.prior and logsumexp(likely + np.log(weights)) < -limits.REFIT_GAIN_WITH_PRIOR
     shown = [i for i in np.argsort(-likely, kind="stable") if candidate.forms[i].columns.any()]
     likeliest = shown[: 1 if hopeless else regime_of(linear).forms_refitted]
@@ -149,11 +149,14 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
 
 
 def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> FormTrial:
-    """Return one form with its variances estimated anew.
+    """Return the fit of one form with all variances estimated again: log Bayes factor, p-value, values.
+
+    Two fits are made. With the prior of plausible sizes, at several scales, the likelihood gives the Bayes factor. With
+    a wide prior of `FREE_SIZES` plausible sizes, as good as none, come the values θ and the Wald test θᵀ C⁻¹ θ.
 
     Args:
-        start: (c,) variances to begin with.
-        scale: the one that is likeliest there.
+        start: (c,) variances at which the fit begins.
+        scale: multiple of the plausible sizes that is likeliest there.
     """
     mixed = linear.mixed
     G = FurtherColumns(mixed, (form.selected,))
@@ -194,10 +197,10 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
 
 
 def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[tuple[Candidate, float]]:
-    """Return the most likely candidates at the null's variances, with all their parameters or those of one joint.
+    """Return up to `count` candidates with the largest gain at the variances of the null model, best first.
 
     Returns:
-        With what they gain there (nats), best first.
+        Candidates with the log Bayes factor (nats) of their best form there.
     """
 
     def largest_gain(candidate: Candidate) -> float:
@@ -213,15 +216,25 @@ def form_weights(candidate: Candidate) -> Array:
 
 
 def weights_of_masks(masks: Sequence[Mask]) -> Array:
-    """Return (F,) the same by free parameters (P,): the full forms share one half, those of single joints the other."""
+    """Return the share (F,) of the prior of each form, by its mask (P,) of free parameters.
+
+    Forms with as many free parameters as the first share one half, the smaller ones the other.
+    """
     kept = np.array([keep.sum() for keep in masks])
     whole = kept == kept[0]
     return np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1))
 
 
 def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[tuple[float, float]], bool]:
-    """Return the gain of each form (F,) over the base at given variances, which a refit can only raise, with its
-    likeliest scale; and whether the first form, of all its parameters, is seen."""
+    """Return (gain, likeliest scale) of each of F forms at given variances, and whether the effect is observable.
+
+    A gain is a log Bayes factor over `base`; fitting the variances again can only raise it. An effect is observable if
+    a parameter of its first form, at plausible size, is at least `SEEN_SIGMAS` sigmas.
+
+    Args:
+        base: the null model.
+        at: the same model at the variances to use.
+    """
     gains = list[tuple[float, float]]()
     seen = False
     for information, vector in _information_by_form(at, candidate):
@@ -233,9 +246,10 @@ def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> 
 
 
 def _information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[tuple[Array, Array]]:
-    """Yield per form I (p, p) and v (p,) of its log likelihood vᵀθ − ½ θᵀ I θ, θ its parameters in plausible sizes.
+    """Yield for each form the matrix I (p, p) and vector v (p,) of its log likelihood vᵀθ − ½ θᵀIθ.
 
-    They are selected from those of the whole effect: the parameters of one joint are among those of all.
+    θ are its parameters in units of their plausible sizes. I and v are computed once per term, for all its parameters;
+    forms with fewer of them select rows and columns.
     """
     of_terms = [list(forms) for _, forms in groupby(candidate.forms, key=lambda form: id(form.term))]
     sums = linear.information([whole.selected for whole, *_ in of_terms])
@@ -246,8 +260,13 @@ def _information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[
 
 
 def _gain_at_null(linear: LinearModel, information: Array, vector: Array) -> tuple[float, float]:
-    """Return the log Bayes factor over all scales of what the views tell at the null's variances, and the likeliest
-    scale: cheap, and an upper hand for what cannot help."""
+    """Return the log Bayes factor at the variances of `linear`, averaged over all scales, and the likeliest scale.
+
+    It needs no fit, and so sorts out forms that cannot help.
+
+    Args:
+        information, vector: (p, p) and (p,) of the log likelihood, parameters in units of their plausible sizes.
+    """
     shares = regime_of(linear).scales
     evidence = log_evidence_at_scales(information, vector, shares)
     likeliest = int((evidence + np.log(list(shares.values()))).argmax())
@@ -262,9 +281,14 @@ def start_with_effects(
     model: Model,
     gate: float,
 ) -> Model:
-    """Return the model with another run's arm in place of its effects, if any, and with further effects by name.
+    """Return the model from which a fit begins: the given one, with further effects.
 
-    Events and time constants begin at the value that explains most; all else at zero.
+    Effects with a grid, events and time constants, begin at their best fit; all others at zero.
+
+    Args:
+        effects: names of effects to add.
+        arm: another run's effects of joints and links, which replace those of the model; None: these stay.
+        gate: largest distance between partners, length_unit.
     """
     if arm:
         known_arm = bind_to_session(arm, measurement)
@@ -298,7 +322,7 @@ class ScatterLimit:
 
 
 def scatter_limit(session: SessionData) -> ScatterLimit:
-    """Return what the session states under [robot] repeatability, else the largest usual scatter."""
+    """Return the repeatability that the session states under [robot]; else the scatter that no sound arm exceeds."""
     stated, (rotation, translation) = session.repeatability, limits.IMPLAUSIBLE
     usual = translation * METRES["mm"] / METRES[session.length_unit]
     return ScatterLimit(
@@ -310,7 +334,7 @@ def scatter_limit(session: SessionData) -> ScatterLimit:
 
 
 def expected_scatter(linear: LinearModel, limit: ScatterLimit) -> ScatterLimit:
-    """Return what the poses may scatter by: as stated, else what flange and joints of an ordinary arm do together."""
+    """Return the scatter expected of the poses: as stated, else that of an ordinary arm, flange and joints."""
     flange = usual_twist(linear.measurement.length_unit)[[0, 3]]
     usual = np.sqrt(flange**2 + USUAL_JOINT_SCATTER**2 * linear.flange_per_joint)
     rotation, translation = (limits.ORDINARY_SCATTER * usual).tolist()
@@ -322,11 +346,11 @@ def expected_scatter(linear: LinearModel, limit: ScatterLimit) -> ScatterLimit:
 
 
 def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
-    """Return whether the views show more than an expected scatter leaves, and chance explains.
+    """Return whether the residual of the views is larger than an expected scatter and chance allow.
 
-    What is left of all numbers, each in units of its noise as the residual counts them, is a square whose mean and
-    variance follow from the expected covariance (Satterthwaite). Nothing is estimated: what no scatter explains could
-    hide in an estimate of it.
+    With the projection M = 1 − UUᵀ beside hand-eye and effects, and the expected covariance C of the reduced
+    observations in units of their noise, |M z|² has the mean tr(MC) and the variance 2 tr(MCMC). A χ² of matching
+    degrees of freedom gives the limit (Satterthwaite). C is not estimated: the estimate would absorb the excess.
     """
     mixed = linear.mixed
     noise = np.diagonal(mixed.components[NOISE], axis1=1, axis2=2)
@@ -351,11 +375,11 @@ def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
 
 
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
-    """Return whether the poses scatter as no arm does, or by more than is stated and chance explains.
+    """Return whether the poses scatter more than any sound arm, or more than is stated and chance allows.
 
-    All of it counts, what repeats too: the views may not tell which it is. An estimated variance of ν degrees of
-    freedom exceeds a stated one by χ²(ν)/ν at most; ν where the scatter is as stated, since what is large by chance
-    looks well known.
+    Repeating errors count as scatter here, since the views may not tell them apart. An estimated variance with ν
+    degrees of freedom may exceed a stated one by the factor χ²(ν)/ν. ν is computed at the stated variance, because an
+    estimate that is large by chance would look too well known.
     """
     linear = linear.restricted(())
     plausible = ((limit.rotation, limit.rotation_stated), (limit.translation, limit.translation_stated))

@@ -91,12 +91,14 @@ class ForwardSelection:
 
 
 def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> ForwardSelection:
-    """Return the effects that are missing at once.
+    """Return the effects that are missing together, found by adding and removing one at a time.
 
-    One effect alone may explain more than each of two that are there, because it imitates a part of both. So
-    effects are added one by one as long as one can be named beside those before; then each must hold its
-    place beside all the others. What was found first may still stand in the way of others that together do more: they
-    take its place where they also predict views left out better (`exchanged_set`).
+    One effect alone may explain more than each of two true ones, because it imitates a part of both. So effects are
+    added as long as one is certain beside those before, then each is tested with all others in the model. At last sets
+    of other effects replace the chosen ones, if they are likelier and predict views left out better (`exchanged_set`).
+
+    Args:
+        best: the effect to begin with.
     """
     physical = [c for c in candidates if not c.empirical]
     selection = _stable_selection(linear, physical, _add_effects(linear, physical, [best]))
@@ -106,11 +108,10 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
 
 
 def find_better_effects(state: RunData, added: Collection[str]) -> list[str]:
-    """Return effects that together do better than those that were added to a model, some of which they do without; else
-    none.
+    """Return names of effects that together do better than those that were added to a run's model; [] without such.
 
     Args:
-        added: effects of the model that may go.
+        added: names of effects of the model that may be replaced; the others stay.
     """
     terms = [term for term in state.model.terms if term.name not in added]
     linear = linearise(state.session, state.measurement, state.model.with_terms(terms), state.gate)
@@ -123,9 +124,9 @@ def find_better_effects(state: RunData, added: Collection[str]) -> list[str]:
 def _better_selection(
     linear: LinearModel, candidates: Sequence[Candidate], selection: ForwardSelection
 ) -> ForwardSelection | None:
-    """Return other effects that hold their place, and together do better; None where there are none.
+    """Return a better selection with other effects, each tested beside all others; None where there is none.
 
-    What was refused, as it errs beyond the measured poses, is not tried again.
+    Effects that the present selection refused, since they err beyond the measured poses, are not tried again.
     """
     instead = exchanged_set(linear, [c for c in candidates if c.name not in selection.refused], selection.effects)
     if not instead:
@@ -137,11 +138,15 @@ def _better_selection(
 def _stable_selection(
     linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]
 ) -> ForwardSelection:
-    """Return effects of those chosen that hold their place, with others that then can be named.
+    """Return a selection in which every effect is certain beside all others and holds at ends of joint ranges left out.
 
-    Of those that err beyond the measured poses, beside the likeliest further effect too, the one that errs most is left
-    out, and the search goes on: what it imitated others may explain. At last one that errs at some end gives way to
-    another that does the same and is likelier to hold beyond.
+    Each round removes effects that are not certain. Then the one that predicts the ends worst goes, unless it helps
+    there beside the likeliest further effect; others may explain what it imitated, so effects are added again. Where
+    none is wrong at the ends altogether, one that is wrong at a single end is exchanged for one that predicts better.
+    It ends when nothing is left to remove or exchange.
+
+    Args:
+        chosen: effects to begin with.
     """
     remaining = list(candidates)
     exchanged = set[str]()
@@ -181,8 +186,10 @@ def _stable_selection(
 def _helps_beside_next(
     linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked], r: Ranked
 ) -> bool:
-    """Return whether one of the effects helps at the ends beside the likeliest further one, which is too little to be
-    named: without that it takes a part of it for its own, and carries it beyond."""
+    """Return whether a chosen effect r predicts ends of joint ranges better once the likeliest further effect is added.
+
+    That further effect may be too small to be named. Without it, r takes over a part of it, and errs at the ends.
+    """
     beside = conditioned_on_effects(linear, chosen)
     further = promising(beside, [c for c in candidates if c.name not in {r.name for r in chosen}], 1)
     if not further or further[0][1] < 0:
@@ -195,7 +202,7 @@ def _helps_beside_next(
 
 
 def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
-    """Return further effects, one by one, as long as one can be named beside those before."""
+    """Return the chosen effects with further ones, added as long as one is certain, up to `MAX_JOINT_EFFECTS`."""
     chosen = list(chosen)
     while len(chosen) < limits.MAX_JOINT_EFFECTS:
         others = [c for c in candidates if c.name not in {r.name for r in chosen}]
@@ -207,10 +214,10 @@ def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: S
 
 
 def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | None:
-    """Return the effect that explains most of what is left, if it can be named.
+    """Return the most likely effect that is certain in the model `base`; None where there is none.
 
-    What seems to gain less than half of the best is fitted only where nothing else can be named: beside that one it
-    has its turn again.
+    Candidates with less than `NEAR_BEST_GAIN` of the best quick gain are fitted only if none of the others is certain;
+    they are tried again in later rounds.
     """
     likely = promising(base, others, limits.CANDIDATES_TRIED)
     near = [c for c, gain in likely if gain >= limits.NEAR_BEST_GAIN * likely[0][1]]
@@ -226,8 +233,14 @@ def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | Non
 def _eliminate_backward(
     linear: LinearModel, chosen: Sequence[Ranked], tests: int
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
-    """Return the effects that can still be named beside all the others, and what each does beyond the measured
-    poses."""
+    """Return the chosen effects that are certain with all others in the model, and their test at ends of joint ranges.
+
+    Effects are judged in order; one that fails is removed before the next is judged. All are first scored in parallel
+    beside all the others. These results hold as long as no effect fails or changes its form; then they are redone.
+
+    Returns:
+        Effects kept; and by name the test, None where the views are too few for one.
+    """
     start = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
 
     def beside_others(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
@@ -259,12 +272,15 @@ def find_exchange(
     chosen: Sequence[Ranked],
     beyond: Mapping[str, Extrapolation | None],
 ) -> tuple[str, str, Ranked] | None:
-    """Return the first effect that has to give way, why, and what takes its place; None if all may stay.
+    """Return the name of an effect to exchange, the reason, and its replacement; None if all chosen effects may stay.
+
+    An effect is exchanged if it errs at some end of a joint's range, and no longer helps there once a rival that
+    predicts the ends better is in the model.
 
     Args:
-        candidates: that may take a place.
-        chosen: effects beside each other.
-        beyond: what each of them does at the ends, beside the others.
+        candidates: possible replacements.
+        chosen: effects in the model together.
+        beyond: by name, each one's test at the ends with the others in the model.
     """
     names = {r.name for r in chosen}
     for r in chosen:
@@ -283,9 +299,14 @@ def find_exchange(
 def _better_extrapolating_effects(
     rest: LinearModel, candidates: Sequence[Candidate], at_ends: Extrapolation
 ) -> list[Ranked]:
-    """Return effects that are likelier to hold at a further end than one that was found, the likeliest first.
+    """Return certain effects that more probably predict a further end of a joint's range than a given test says.
 
-    What begins at some view has no ends of its own: from the second view on it is what it imitates.
+    The best comes first. Events are left out: one that begins at the second view imitates a lasting effect, and the
+    ends cannot tell the two apart.
+
+    Args:
+        rest: the model without the effect that would be exchanged.
+        at_ends: the test of that effect.
     """
     better = list[tuple[float, Ranked]]()
     lasting = [c for c in candidates if not any(p.discrete for p in c.parameters)]
@@ -298,10 +319,15 @@ def _better_extrapolating_effects(
 
 
 def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Candidate]:
-    """Return effects that together are 20 to 1 likelier than those chosen, some of which they do without; else none.
+    """Return a set of effects 20 to 1 likelier than the chosen one, without some of its effects; [] if there is none.
+
+    All sets are compared at the variances beside the chosen effects: information and vector of all candidates are
+    computed once, and sets select from them. Up to `_TAKEN_OUT` chosen effects are removed, then a forward selection
+    and a backward elimination follow.
 
     Args:
-        candidates: that may take a place; of those with a time constant or an event only the chosen count.
+        candidates: possible members; those with time constants or events only if they are chosen.
+        chosen: the present effects.
     """
     if not chosen:
         return []
@@ -319,7 +345,7 @@ def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: 
     vector = stacked.T @ at.white_residual
 
     def log_posterior(numbers: Sequence[int]) -> float:
-        """Return that of some of the free candidates together, not yet normalised."""
+        """Return the log posterior of a set of candidates, by their indices in `free`, not yet normalised."""
         index = np.concatenate([np.zeros(0, np.int64), *(places[k] for k in numbers)])
         evidence = log_evidence_at_scales(information[np.ix_(index, index)], vector[index], PLAUSIBLE)
         return log_mixture(evidence, PLAUSIBLE) + len(numbers) * float(np.log(limits.PRIOR_PHYSICAL / len(free)))
@@ -338,8 +364,10 @@ def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: 
 
 
 def is_better_set(linear: LinearModel, new: Sequence[Ranked], old: Sequence[Ranked]) -> bool:
-    """Return whether effects are 20 to 1 likelier than others, all variances fitted, and predict views left out
-    better."""
+    """Return whether a new set of effects is 20 to 1 likelier than an old one, and predicts views left out better.
+
+    The log posteriors are those of fits with all variances.
+    """
     likelier = _log_posterior(linear, new) > _log_posterior(linear, old) + limits.ODDS
     shares = [group_share(linear, [r.score for r in effects])[0] for effects in (new, old)]
     return bool(likelier and shares[0] < shares[1])
@@ -357,13 +385,13 @@ def _log_posterior(linear: LinearModel, chosen: Sequence[Ranked]) -> float:
 
 
 def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> tuple[list[Ranked], dict[str, str]]:
-    """Return effects beside each other that all help on views left out; and what is idle, the weakest first.
+    """Return the chosen effects that all help on views left out, and the dropped ones with the reason, by name.
 
-    What would be dropped again as soon as it is in the model is neither named nor added: of hundreds of poses an effect
-    is seen that moves hardly anything, and that anything else may do as well.
+    The weakest is tested first; after each one that is dropped, the others are scored again. Hundreds of poses show
+    even effects that move hardly anything: such would be dropped from the model again at once.
 
     Args:
-        tests: candidates among which they were chosen.
+        tests: number of candidates among which they were chosen.
     """
 
     def beside(others: Sequence[Ranked], r: Ranked) -> Ranked:

@@ -63,11 +63,13 @@ class CrossValidation:
         return self.poses <= 1 - self.poses_sigma
 
     def fit_rejection_reason(self, name: str, share: float, *, zero: bool) -> str | None:
-        """Say why an effect that was fitted does not stay, if it does not: what views left out say beyond uncertainty.
+        """Return why a fitted effect is dropped, by views left out; None where it stays.
 
-        Where the error of their points does not tell, that of their poses does.
+        It is dropped if the error of their points rose beyond its uncertainty. Where that error neither rose nor fell,
+        their poses decide, and whether the effect differs from zero.
 
         Args:
+            name: of the effect.
             share: of the mean square error on views left out that the fit with the effect leaves.
             zero: no parameter of the fitted effect differs from zero.
         """
@@ -79,8 +81,10 @@ class CrossValidation:
         return None
 
     def rejection_reason(self, name: str) -> str | None:
-        """Say why an effect should not be in a model of many poses, if it should not: these show even what hardly
-        helps."""
+        """Return why an effect does not belong in a model of many poses; None where it lowers the error enough.
+
+        Many poses show even effects that hardly help, so a least gain is asked for.
+        """
         if self.helps and self.poses <= limits.MAX_REMAINING_SHARE:
             return None
         share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
@@ -88,10 +92,10 @@ class CrossValidation:
 
 
 def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
-    """Return what the best form of a candidate leaves, added to the model in the linear approximation.
+    """Return what remains with the best form of a candidate in the model, in the fit and on views left out.
 
-    What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
-    are predicted, beside everything else that poses may err by.
+    All is linear. The errors of points are those of a fit in which poses scatter independently, as in `add`. Those of
+    poses, which decide whether the effect helps, have all other pose errors as random effects.
     """
     fitted = linear.restricted(())
     beside = scored.base_model or linear
@@ -119,11 +123,10 @@ def group_helps(share: float, sigma: float) -> bool:
 
 
 def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
-    """Return the mean square error of left-out poses with effects that cannot be told apart, all of them together, over
-    that of the present model.
+    """Return the mean square error of left-out poses with a group of effects in the model, over that without them.
 
     Returns:
-        The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
+        The ratio, and its standard error with folds as samples. Effects of points count by what they do to poses.
     """
     a = linear.design.shape[1]
     precision = np.concatenate([np.zeros(a), *(_precision_of_sizes(linear, scored)[a:] for scored in group)])
@@ -135,12 +138,13 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
 
 
 def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, Array, Array]:
-    """Return the fit with a candidate; (2, G) squares of each fold that fits without it leave, with the candidate and
-    without; and (2, G) scatter of its poses.
+    """Return the fit with a candidate, and what G folds of views leave when each is predicted by a fit without it.
 
-    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
-    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
-    left to see does not count for more than that.
+    If a fold carries most of an effect, the rest hardly shows it. So these fits have a prior: the effect is about as
+    large as with all views, of either sign. The model's other coefficients have none.
+
+    Returns:
+        The fit; sums of squares (2, G) of the folds' points, with the candidate and without; and (2, G) of their poses.
     """
     points = scored.candidate.points
     sums = None if points is None else points.select(scored.form.keep)
@@ -158,16 +162,24 @@ def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, A
 
 
 def _precision_of_sizes(linear: LinearModel, scored: Score) -> Array:
-    """Return (a + k,) of model and candidate in fits without some views: the candidate as large as it was found."""
+    """Return the prior's precisions (a + k,), 1/size², of a coefficients of the model and k of a candidate.
+
+    Those of the model are zero: no prior. A candidate's size is √(value² + sigma²) of its fit with all views.
+    """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
     size = np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes)
     return np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
 
 
 def _steadiness(linear: LinearModel, trial: LinearTrial, response: Array) -> float:
-    """Return the smallest share of an effect that remains without one view.
+    """Return the smallest share of an effect that remains in a fit without one view; 0 for an effect of zero.
 
-    A combination of parameters that one view carries alone vanishes without it.
+    With the whitened columns X and values θ, and θ_v without view v, it is min over v of (Xθ)ᵀ X θ_v / |Xθ|². An effect
+    that a single view carries has a share near zero.
+
+    Args:
+        trial: fit with the effect, its parameters last.
+        response: (·, k) of the observation to them.
     """
     whole = trial.solve()
     size = response.shape[1]
@@ -225,7 +237,10 @@ def untested_ends_reason(names: Sequence[str]) -> str:
 
 
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
-    """Return the best form of a candidate at the ends; None where the views are too few to leave one out."""
+    """Return how well a candidate predicts views at the ends of joint ranges, each end from all other views.
+
+    None where the views are too few to leave an end out.
+    """
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:
         return None
@@ -271,10 +286,10 @@ class _HalfEvidence:
 
 
 def objection_in_halves(scored: Score) -> str | None:
-    """Return what halves of the views say against a candidate, in words: None where nothing.
+    """Return the reason, as text, to reject a candidate by halves of the views; None where there is none.
 
     Its best form is fitted in either half. It has to help in the other half, on average over several ways to halve,
-    and both halves have to show the same size. Asked only where pose errors have a prior.
+    and both halves have to show the same size. None also where pose errors have no prior, and for labelled points.
     """
     base = scored.base_model
     if base is None or base.observation.numbers_per_view is not None:
