@@ -78,22 +78,11 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
             [(_as_stated(measurement, *_moved(model, term, step), k, near) - here) / _STEP for step in steps]
         ).reshape(len(steps), 6)
         sigma = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", J, covariance, J), 0.0))
-        no_sigma, unobservable = _unseen(
-            axis, term, without_robot=not axes.has_robot, is_frame_axis=k == axes.frame_axis
-        )
+        no_sigma, unobservable = _unseen(axis, term, has_robot=axes.has_robot, is_frame_axis=k == axes.frame_axis)
         sigma[:3][no_sigma[0]] = np.nan
         sigma[3:][no_sigma[1]] = np.nan
-        places.append(
-            AxisPlace(
-                axis.name,
-                axis.kind,
-                here[:3],
-                sigma[:3],
-                here[3:] if axis.is_rotary else None,
-                sigma[3:] if axis.is_rotary else None,
-                unobservable,
-            )
-        )
+        point, point_sigma = (here[3:], sigma[3:]) if axis.is_rotary else (None, None)
+        places.append(AxisPlace(axis.name, axis.kind, here[:3], sigma[:3], point, point_sigma, unobservable))
     return tuple(places)
 
 
@@ -111,15 +100,13 @@ def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
     covariance = np.zeros((size, size))
     beside = known.with_hand_eye
     covariance[:6, :6] = beside[:, :6] if beside.size else model.covariance
-    at = [known.names.index(name) if name in known.names else -1 for name in names]
-    for i, a in enumerate(at):
-        if a < 0:
-            continue
-        for j, b in enumerate(at):
-            if b >= 0:
-                covariance[6 + i, 6 + j] = known.matrix[a, b]
-        if beside.size:
-            covariance[:6, 6 + i] = covariance[6 + i, :6] = beside[:, 6 + a]
+    fitted = [i for i, name in enumerate(names) if name in known.names]
+    rows = 6 + np.array(fitted, int)
+    at = np.array([known.names.index(names[i]) for i in fitted], int)
+    covariance[np.ix_(rows, rows)] = known.matrix[np.ix_(at, at)]
+    if beside.size:
+        covariance[:6, rows] = beside[:, 6 + at]
+        covariance[rows, :6] = beside[:, 6 + at].T
     return _STEP * np.eye(size), covariance
 
 
@@ -162,13 +149,13 @@ def _middle(measurement: Measurement, model: Model) -> Array:
 
 
 def _unseen(
-    axis: Axis, term: Term | None, *, without_robot: bool, is_frame_axis: bool
+    axis: Axis, term: Term | None, *, has_robot: bool, is_frame_axis: bool
 ) -> tuple[tuple[bool, bool], tuple[str, ...]]:
     """Return (direction, point): True where it has no sigma; and words for what the views do not show.
 
     Args:
         term: axis_placement; None: it was not fitted.
-        without_robot: axes alone move what is scanned.
+        has_robot: False: axes alone move what is scanned.
         is_frame_axis: without a robot, the axis in whose frame the others are given: the hand-eye places it.
     """
     if is_frame_axis:
@@ -178,7 +165,7 @@ def _unseen(
     mine = [p for p in term.parameters if p.name.partition("_")[2] == axis.name]
     turned = [p.fitted for p in mine if p.unit == "rad"]
     moved = [p.fitted for p in mine if p.unit != "rad"]
-    if without_robot and any(turned) and (any(moved) or not moved):
+    if not has_robot and any(turned) and (any(moved) or not moved):
         # The common frame may turn about its own axis and move along it: one of two parameters is always held.
         return (False, False), ()
     unknown = [f"{what} not known" for what, seen in (("direction", turned), ("place", moved)) if not all(seen)]

@@ -130,16 +130,8 @@ def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
     width = _whole_number(level, "width", "image_width")
     height = _whole_number(level, "height", "image_height")
     size = None if width is None or height is None else (width, height)
-    return Intrinsics(
-        file,
-        fx,
-        fy,
-        cx,
-        cy,
-        distortion=_distortion(file, level),
-        size=size,
-        units_per_metre=_units_per_metre(file, level),
-    )
+    distortion = _distortion(file, level)
+    return Intrinsics(file, fx, fy, cx, cy, distortion, size, units_per_metre=_units_per_metre(file, level))
 
 
 def _camera_matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
