@@ -262,9 +262,10 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
 
 
 def stacked(laws: Sequence[Law]) -> Iterator[tuple[Place, Array, Indices]]:
-    """Give laws of one place and as many shapes together: the place, shapes (S, V, R), numbers (S, F) of their forms.
+    """Yield laws with the same place and number R of shape columns together, so that their sums are computed at once.
 
-    F is how many choices of the place's axes each has, the whole first.
+    Each item is the place, shapes (S, V, R) of S laws over V views, and indices (S, F) in `laws` of their F forms: one
+    for each choice of the place's axes, all of them first.
     """
     alike: dict[tuple[str, int], list[int]] = {}
     for i, law in enumerate(laws):
@@ -317,10 +318,13 @@ def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]
 
 
 def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) -> float:
-    """Return the chance that the clearest of all laws is as clear as this one.
+    """Return the family-wise p-value of the clearest law: the chance that any law looks as clear in mere scatter.
 
-    Laws resemble each other. So where their number alone does not decide, the clearest is drawn from scatter and noise
-    of as many degrees of freedom as the law's own are known to.
+    Bonferroni's value is too large, since laws resemble each other. Where it does not decide by itself, residuals are
+    drawn at random `_DRAWS` times, and the draws counted in which some law is as clear (Monte Carlo test).
+
+    Args:
+        ranked: the law, with Bonferroni's value in `adjusted`.
     """
     by_count = ranked.adjusted
     if by_count < limits.ALPHA_UNKNOWN or by_count > _DRAWN_UP_TO or linear.mixed.z.size > _MOST_DRAWN:
@@ -399,7 +403,11 @@ def law_of(ranked: Ranked) -> Law:
 
 
 def law_size(linear: LinearModel, ranked: Ranked) -> tuple[float, float, str]:
-    """Return how far a law turns its joint, or else moves the views at the part, between its extremes; sigma; unit."""
+    """Return the size of a law with its sigma and unit: the largest change of the joint's angle, or of the views.
+
+    The change is counted from the view with the least angle, or from the first view; views move at the part. The unit
+    is rad, or the length unit.
+    """
     scored = ranked.score
     law = law_of(ranked)
     if law.place.joint is not None:
@@ -465,7 +473,11 @@ def _no_function(*_: object) -> None:
 
 
 def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
-    """Return (L,) log Bayes factors at the null's variances over all scales, and the likeliest scale of each."""
+    """Return log Bayes factors (L,) of all L forms at the null's variances, over all scales, and the likeliest scales.
+
+    With eigenvalues k of the information and projections g of the vector, parameters in plausible sizes, log BF at
+    scale s is ½ Σ [s² g² / (1 + s² k) − log(1 + s² k)].
+    """
     scales = regime_of(linear).scales
     at = np.array(list(scales))[:, None, None, None]
     share = np.log(list(scales.values()))
@@ -505,7 +517,10 @@ def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
 
 
 def _places(linear: LinearModel) -> Iterator[Place]:
-    """Give what the reference carries, what stands at the far end of the arm, and the joints."""
+    """Yield the places where a law may act: the two bodies at the ends of the arm, each joint, and each link's length.
+
+    A link that moves the views as a body does, or hardly at all, is no place of its own.
+    """
     measurement = linear.measurement
     centre = linear.observation.centre
     count = measurement.views.count
@@ -533,7 +548,10 @@ def _places(linear: LinearModel) -> Iterator[Place]:
 
 
 def drivers_of(views: Views) -> Iterator[Driver]:
-    """Give all that views may follow."""
+    """Yield what the error of views may depend on, with its shapes.
+
+    These are time or order, covariates, a step at some view, angles and moves of joints, torques, and gravity.
+    """
     order = np.arange(views.count, dtype=float)
     known = [(TIME, "s", views.time)] if views.has("time") else [(NUMBER, "view", order)]
     known += [(name, "", values) for name, values in views.covariates.items()]
@@ -572,7 +590,12 @@ def drivers_of(views: Views) -> Iterator[Driver]:
 
 
 def _fallen(along: Array, friction: float) -> Mask:
-    """Return (V, k) to which side gravity (V, k) pulled last by more than friction holds."""
+    """Return (V, k) True where gravity last pulled to the positive side of an axis, by more than friction holds.
+
+    Args:
+        along: (V, k) components of gravity along k axes, in the order of the views; the first view counts in any case.
+        friction: component below which nothing moves.
+    """
     pulled = np.abs(along) > friction
     pulled[0] = True
     last = np.maximum.accumulate(np.where(pulled, np.arange(len(along))[:, None], 0), axis=0)
@@ -580,14 +603,21 @@ def _fallen(along: Array, friction: float) -> Mask:
 
 
 def _lines(name: str, unit: str, values: Array) -> Iterator[Driver]:
-    """Give what is followed in proportion, if it changes."""
+    """Yield a driver with the one shape "in proportion", values over their largest size; nothing if they are constant.
+
+    Args:
+        values: (V,) of the views.
+    """
     if np.ptp(values) > _SAME_VALUE * max(np.abs(values).max(), 1.0):
         shapes = {"in proportion": (values / np.abs(values).max())[:, None]}
         yield Driver(name, unit, values, shapes, kinds=_NOT_LINKS)
 
 
 def _smooth(values: Array) -> dict[str, Array]:
-    """Return a line from the first value on, and a polynomial where there are enough values."""
+    """Return shapes (V, R) over values (V,): a line, and Legendre polynomials where there are enough different values.
+
+    They are zero in the first view, and 1 at the most.
+    """
     x = 2 * (values - values.min()) / np.ptp(values) - 1
     powers = np.polynomial.legendre.legvander(x, _DEGREE)[:, 1:]
     powers = powers - powers[0]
@@ -598,7 +628,10 @@ def _smooth(values: Array) -> dict[str, Array]:
 
 
 def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
-    """Give the forms of one law with their shares."""
+    """Yield the forms of one law with their shares of its prior, which add up to 1 but for rarely growing links.
+
+    A form is a shape together with a choice of the place's axes; of joints, counted from the first view or the mean.
+    """
     shares = 1 / len(driver.shapes)
     for shape in driver.shapes:
         if place.joint is not None:
@@ -656,7 +689,7 @@ def _says(
     driver: Driver,
     laws: Callable[[], Sequence[Span]],
 ) -> bool:
-    """Return whether an effect is a law: it acts there and follows that, as it declares or as its columns show."""
+    """Return whether an effect implies a law: same place and driver, as the effect declares or as its columns show."""
     effect = candidate.effect
     # An external axis moves a body as a whole: the part, or the base of what it carries.
     if effect.place != place.kind and not (effect.place == "axis" and place.kind in _BODIES):

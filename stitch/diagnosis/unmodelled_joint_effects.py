@@ -137,15 +137,14 @@ class JointEffect:
 
 
 def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tuple[JointEffect, ...]:
-    """Return what each kind of unmodelled effect of each joint explains, likeliest first; () without joints or prior of
-    errors.
+    """Return the unmodelled effect of each kind for each joint with its log Bayes factor, likeliest first.
 
-    All variances are sought anew for the likeliest few, since what an effect explains is no scatter; for the others
-    their likelihood at the null's is a bound. Its size is fitted with all others; `log_posterior_of_any` charges for
-    that.
+    An unmodelled effect is a smooth random function of what it follows, such as the joint's angle. All variances are
+    fitted again for the likeliest few; the others have a bound, their gain at the null's variances. Sizes are fitted,
+    for which `log_posterior_of_any` charges. () without joints, or where pose errors have no prior.
 
     Args:
-        kinds: None: all that the views show.
+        kinds: what the effects follow; None: all kinds.
     """
     processes = _joint_processes(base)
     tried = list[JointEffect]()
@@ -177,8 +176,10 @@ def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tupl
 
 
 def joint_effect_log_posterior(base: LinearModel) -> float:
-    """Return the log posterior that some joint errs so, as those of effects in the same model (`Ranked`); −∞ where the
-    views tell of none."""
+    """Return the log posterior that some joint has an unmodelled effect, comparable with those of effects (`Ranked`).
+
+    −∞ where none can be tested.
+    """
     effects = joint_effects(base)
     factors = np.array([effect.log_bayes_factor for effect in effects])
     return float(log_posterior_of_any(factors)) if effects else -np.inf
@@ -193,8 +194,10 @@ def log_posterior_of_any(log_bayes_factors: Array) -> Array:
 
 
 def joint_effect_covariances(base: LinearModel) -> list[list[Array]]:
-    """Return (n, n) in the reduced observations of the effects of usual size, those of one kind of one joint
-    together."""
+    """Return covariances (n, n) of unmodelled effects of usual size in the reduced observations.
+
+    Each inner list holds those of one kind for one joint.
+    """
     return [
         [SMOOTH_SCALE**2 * base.reduce(base.reduce(smooth.twist_covariance(p)).T) for p in smooth.of_joint(joint)]
         for smooth in _joint_processes(base).values()
@@ -227,8 +230,9 @@ def _joint_processes(base: LinearModel) -> dict[str, SmoothErrors]:
 
 
 def _likeliest_per_joint(effects: Sequence[JointEffect]) -> tuple[JointEffect, ...]:
-    """Return the likeliest effect of every joint within 20 to 1 of the likeliest, with what it may follow as well; ()
-    where none is so much likelier than nothing.
+    """Return the likeliest effect of every joint that is within 20 to 1 of the likeliest joint.
+
+    `may_follow` lists the kinds within 20 to 1 of it. () where all effects together are not 20 to 1 over nothing.
 
     Args:
         effects: of all kinds and joints, likeliest first.
@@ -273,11 +277,11 @@ class JointCurve:
 
 
 def joint_curves(effects: Sequence[JointEffect]) -> tuple[JointCurve, ...]:
-    """Return the partial dependence (Friedman 2001, Ann. Stat. 29:1189) of each effect on all that it follows, largest
-    share first.
+    """Return curves of each effect along everything that it follows, the largest share of its variance first.
 
-    The effect is a random function; what the views say of it is its mean and covariance given their numbers, with the
-    hand-eye free and at the fitted sizes of all errors (kriging; Rasmussen & Williams 2006, eq. 2.41).
+    A curve is a partial dependence (Friedman 2001, Ann. Stat. 29:1189): averaged over the other arguments. The effect
+    is a random function; its mean and covariance given the observations are those of a Gaussian process (Rasmussen &
+    Williams 2006, eq. 2.41), with the hand-eye free. Curves with a small share are left out.
     """
     curves = list[JointCurve]()
     for effect in effects:
@@ -299,7 +303,10 @@ class _Covariate:
 
 
 def _covariates(effect: JointEffect) -> list[_Covariate]:
-    """Return the numbers along which the trend of an effect can be told."""
+    """Return the arguments of an effect, by its kind, with the factors of its covariance for each.
+
+    Covariances are products, one factor an argument: the remaining kernel is the product of the other factors.
+    """
     k = effect.joint - 1
     views = effect.base.measurement.views
     q = views.joints

@@ -139,8 +139,10 @@ def significant_time_effect(linear: LinearModel) -> FittedProcess | None:
 
 
 def unmodelled_log_posterior(base: LinearModel) -> float:
-    """Return the log posterior of the likelier unmodelled effect, of some joint or of the flange in time, as those of
-    effects (`Ranked`); −∞ where there is none."""
+    """Return the larger log posterior of an unmodelled effect of some joint, and of the flange in time.
+
+    It is comparable with those of effects (`Ranked`); −∞ where neither can be tested.
+    """
     in_time = likeliest_time_effect(base)
     of_flange = -np.inf if in_time is None else in_time[1] - ANY_SIZE + float(np.log(limits.PRIOR_UNKNOWN))
     return max(joint_effect_log_posterior(base), of_flange)
@@ -178,13 +180,13 @@ def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedTrend
 
 
 def _waves(frequency: float, time: Array) -> Array:
-    """Return (T, 2) of which all sines of a frequency (1/step) are made."""
+    """Return cosine and sine (T, 2) of a frequency (1/step) at times (T,) in steps; all its sines combine these."""
     phase = 2 * np.pi * frequency * time
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
 def _wave_at_phase(waves: _Trend, phase: float, time: Array) -> Array:
-    """Return (T, 1) the one of them with a phase."""
+    """Return the sine (T, 1) with one phase (rad) of those that `waves` gives as cosine and sine (T, 2)."""
     return waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]])
 
 
@@ -273,8 +275,11 @@ def time_curve(fitted: FittedProcess) -> TimeCurve:
 
 
 def unmodelled_trends(linear: LinearModel) -> tuple[FittedProcess, ...]:
-    """Return the likeliest smooth processes of a joint or of the flange beside a model; () where pose errors have a
-    prior."""
+    """Return the likeliest smooth errors of a joint or of the flange in time, fitted beside a model, best first.
+
+    All are sized at the null's variances, joints in pairs only for the clearest ones; the best `TRENDS_FITTED` are then
+    fitted. () where pose errors have a prior, which contains such errors already.
+    """
     if regime_of(linear).prior:
         return ()
     flange = wandering_flange(linear)
@@ -297,8 +302,10 @@ def unmodelled_trends(linear: LinearModel) -> tuple[FittedProcess, ...]:
 
 
 def least_log_bayes_factor(linear: LinearModel, scored: Score) -> tuple[float, str]:
-    """Return the log Bayes factor of an effect beside that trend which leaves least of it, and the trend in words; ∞
-    where pose errors have a prior."""
+    """Return the least log Bayes factor of an effect with an unnamed smooth trend in the model, and the trend in words.
+
+    (∞, "") where pose errors have a prior: the effect was scored beside such trends already.
+    """
 
     def factor_beside(trend: FittedProcess) -> float:
         """Return the log Bayes factor of the effect beside a trend, at the likelier of the sizes that that may have."""
@@ -327,7 +334,12 @@ class RepeatingError:
 
 
 def reportable(errors: tuple[RepeatingError, ...], implausible: bool) -> tuple[RepeatingError, ...]:
-    """Return those of them that are said: where poses scatter as no arm does, only beside one that stands out."""
+    """Return the errors that are reported: all, or none where the scatter is implausible and no single one stands out.
+
+    Args:
+        errors: kinds of errors that repeat.
+        implausible: True if poses scatter more than those of any sound arm.
+    """
     return errors if not implausible or any(error.of_one for error in errors) else ()
 
 
@@ -394,8 +406,9 @@ def _single_error(linear: LinearModel) -> RepeatingError | None:
 
 
 def _trend_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
-    """Return the likeliest trend of poses that count as scattering independently, where it is 20 to 1 likelier than
-    scatter alone though it is the best of all.
+    """Return the likeliest smooth trend as a repeating error, where it is 20 to 1 likelier than scatter; else ().
+
+    It is for poses that scatter independently. The number of trends that were tried is charged for.
 
     Scatter of the joints counts here, as what repeats least resembles it. It does not where names are asked for: an arm
     that errs by many small effects at once seems to scatter by its joints, and of two tracked arms of one series one
