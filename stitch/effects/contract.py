@@ -255,6 +255,8 @@ class Effect:
     prior: float = 1.0  # prior odds relative to an effect that every arm, mount or part may have
     origin: str = ""  # of a user's: the file that it was loaded from, or `package …`; empty for one of this program
     scanner: str = ""  # the only scanner that has it, of several; empty: all
+    # Of the sensor, where parameters act in proportion: (points (N, 3), view) → (P, N, 3) per unit; None: not known.
+    per_unit: Callable[..., Any] | None = None
 
     @property
     def formula(self) -> str:
@@ -265,7 +267,7 @@ class Effect:
     def at_scanner(self, scanner: str) -> "Effect":
         """Return the effect as one of a single scanner among several, named EFFECT@SCANNER: nothing in other views."""
         function = _AtScanner(self.function, self.place, scanner)
-        return replace(self, name=f"{self.name}@{scanner}", function=function, scanner=scanner)
+        return replace(self, name=f"{self.name}@{scanner}", function=function, scanner=scanner, per_unit=None)
 
     def parameters(
         self,

@@ -39,10 +39,23 @@ def empirical_effects(views: Views) -> list[Effect]:
 
 
 def _effect(
-    group: str, name: str, place: str, function: Callable[..., Array], needs: tuple[str, ...] = (), **specs: Spec
+    group: str,
+    name: str,
+    formula: str,
+    per_unit: Callable[[Array, ScanView], Array],
+    needs: tuple[str, ...] = (),
+    **specs: Spec,
 ) -> Effect:
-    """Return an effect of the empirical tier; `group` is what it follows, for people."""
-    return Effect(name, place, specs, function=function, needs=needs, prefers=(), tier="empirical", group=group)
+    """Return an effect of the sensor whose parameters act in proportion (`Effect.per_unit`)."""
+
+    def distort(points: Array, view: ScanView, **values: float) -> Array:
+        """Return points (N, 3) of a view, scanner frame, moved by all parameters."""
+        return points + np.tensordot([values[name] for name in specs], per_unit(points, view), axes=1)
+
+    distort.__doc__ = formula
+    return Effect(
+        name, "sensor", specs, distort, needs=needs, prefers=(), tier="empirical", group=group, per_unit=per_unit
+    )
 
 
 def _bias(name: str, order: int, shape: Array) -> Effect:
@@ -54,12 +67,12 @@ def _bias(name: str, order: int, shape: Array) -> Effect:
         shape: (V,) P of the covariate scaled to ±1, at each view.
     """
 
-    def bias(points: Array, view: ScanView, k: float) -> Array:
-        """Return points (N, 3) of a view, scanner frame, with its bias along the rays."""
-        return points + view.along(points) * (k * shape[view.index])
+    def along_ray(points: Array, view: ScanView) -> Array:
+        """Return how a bias of 1 moves points (N, 3) of a view, scanner frame: (1, N, 3)."""
+        return shape[view.index] * view.along(points)[None]
 
-    bias.__doc__ = f"along the ray by k·P{order}({name})"
-    return _effect(name, f"bias_{order}_of_{name}", "sensor", bias, k=number("mm", 0.1, 5.0))
+    formula = f"along the ray by k·P{order}({name})"
+    return _effect(name, f"bias_{order}_of_{name}", formula, along_ray, k=number("mm", 0.1, 5.0))
 
 
 def _field() -> Effect:
@@ -68,19 +81,24 @@ def _field() -> Effect:
     Each of three coordinates has a coefficient, in length_unit, for each monomial of degree 1 and 2 in a = x/z, b = y/z
     and d = r/r₀ − 1. Typical sizes of the coefficients move a point at the edge of the field by 0.1 mm.
     """
-    terms = {f"c{axis}_{''.join(factors)}": (axis, factors) for axis in range(3) for factors in _MONOMIALS}
+    names = ["".join(factors) for factors in _MONOMIALS]
+    sizes = [0.1 / prod(_REACH[factor] for factor in factors) for factors in _MONOMIALS]
 
-    def distort(points: Array, view: ScanView, **c: float) -> Array:
-        """x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"""
+    def monomials(points: Array, view: ScanView) -> Array:
+        """Return how a unit of each coefficient moves points (N, 3) of a view, scanner frame: (27, N, 3)."""
         x, y, z = view.away(points).T
         ray = np.sqrt(x * x + y * y + z * z)
         at = {"a": x / z, "b": y / z, "d": ray / view.views.standoff - 1}
-        moved = points.copy()
-        for name in (name for name in terms if c[name]):
-            axis, factors = terms[name]
-            moved[:, axis] += c[name] * prod(at[factor] for factor in factors)
-        return moved
+        moved = np.zeros((3, len(_MONOMIALS), len(points), 3))
+        products = [prod(at[factor] for factor in factors) for factors in _MONOMIALS]
+        for axis in range(3):
+            moved[axis, ..., axis] = products
+        return moved.reshape(-1, len(points), 3)
 
-    sizes = {name: 0.1 / prod(_REACH[factor] for factor in factors) for name, (_, factors) in terms.items()}
-    specs = {name: number("mm", size, 50 * size) for name, size in sizes.items()}
-    return _effect("the scanner's field", FIELD, "sensor", distort, ("optics",), **specs)
+    formula = "x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"
+    specs = {
+        f"c{axis}_{name}": number("mm", size, 50 * size)
+        for axis in range(3)
+        for name, size in zip(names, sizes, strict=True)
+    }
+    return _effect("the scanner's field", FIELD, formula, monomials, ("optics",), **specs)

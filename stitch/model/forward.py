@@ -395,7 +395,10 @@ class PointSlopes:
             pose: (4, 4) T_reference_scanner of the view.
         """
         points, view = scan_points(self.measurement, v, index)
-        return self._differences(lambda terms: point_correction(terms, points, view, pose, steps=1))
+        return self._of_terms(
+            lambda terms: point_correction(terms, points, view, pose, steps=1),
+            lambda per_unit: -per_unit(points, view),
+        )
 
     def at_targets(self, poses: Array) -> Array:
         """Return the derivatives (P, V, S, 3), sensor frame, for the labelled points of all views.
@@ -403,26 +406,46 @@ class PointSlopes:
         Args:
             poses: (V, 4, 4) T_reference_scanner.
         """
+        sightings, views = self.measurement.capture.sightings, self.measurement.target_views
+        assert sightings is not None
         places = target_places(self.measurement, () if self.model is None else self.model.terms, poses)
-        return self._differences(lambda terms: target_correction(self.measurement, terms, poses, places))
+        shown = frames.transform(frames.inverse(poses), places)
 
-    def _differences(self, moved: Callable[[Sequence[Term]], Array]) -> Array:
-        """Return the central differences (P, ...) of a function of the terms in use that returns an array (...)."""
-        if not self._steps:
-            return moved(())[None][:0]
-        return np.array([(moved(up) - moved(down)) / width for up, down, width in self._steps])
+        def undone(per_unit: Callable[..., Array]) -> Array:
+            """Return (P, V, S, 3) what undoes a unit of each parameter of an effect; zero in empty slots."""
+            moved = np.array([per_unit(points, view) for points, view in zip(shown, views, strict=True)])
+            return np.where((sightings.target >= 0)[..., None], -moved.swapaxes(0, 1), 0.0)
+
+        return self._of_terms(lambda terms: target_correction(self.measurement, terms, poses, places), undone)
+
+    def _of_terms(
+        self, correction: Callable[[Sequence[Term]], Array], undone: Callable[[Callable[..., Array]], Array]
+    ) -> Array:
+        """Return the slopes of what must be added to undo terms; `undone` gives it where an effect says its own."""
+        slopes = [correction(())[None][:0]]
+        for term, steps in zip(self.terms, self._steps, strict=True):
+            per_unit = term.effect.per_unit
+            if per_unit is not None and not steps:
+                slopes.append(undone(per_unit))
+            slopes += [((correction(up) - correction(down)) / width)[None] for up, down, width in steps]
+        return np.concatenate(slopes)
 
     @cached_property
-    def _steps(self) -> list[tuple[tuple[Term, ...], tuple[Term, ...], float]]:
-        """Per parameter the terms of the model with it stepped up, with it stepped down, and the width between them."""
-        steps = []
+    def _steps(self) -> list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]]]:
+        """Per term the effects of the model with one parameter larger and smaller, and how far these are apart; none of
+        an effect that says by itself what its parameters do, and is alone among effects of points."""
+        steps = list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]]]()
         for term in self.terms:
             assert self.model is not None
-            for i, parameter in enumerate(term.parameters):
-                # The view of an event is tried, never fitted: its derivative is zero, over any width.
-                size = 0.0 if parameter.discrete else STEP * parameter.typical
-                up, down = (self.model.with_term(moved).terms for moved in _stepped(term, i, size))
-                steps.append((up, down, 2 * size or 1.0))
+            if term.effect.per_unit is not None and not moves_points(self.model.without(term.name).terms):
+                steps.append([])
+                continue
+            # The view of an event is tried, never fitted: nothing answers to it.
+            sizes = [0.0 if parameter.discrete else STEP * parameter.typical for parameter in term.parameters]
+            stepped = (map(self.model.with_term, _stepped(term, i, size)) for i, size in enumerate(sizes))
+            steps.append(
+                [(up.terms, down.terms, 2 * size or 1.0) for (up, down), size in zip(stepped, sizes, strict=True)]
+            )
         return steps
 
 

@@ -184,7 +184,7 @@ class MixedModel:
 
     def covariance(self, variances: Array) -> Array:
         """Return the covariance (B, m, m) of z for variances (c,): Σ λ_i C_i + fixed."""
-        V = np.einsum("c,cbij->bij", variances, self.components)
+        V = np.tensordot(variances, self.components, axes=1)
         return V if self.fixed is None else V + self.fixed
 
     @cached_property
