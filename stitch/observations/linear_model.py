@@ -43,6 +43,8 @@ from stitch.session.measurement import Measurement
 WHITE_COMPONENTS = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
 _NEGLIGIBLE_SHARE = 1e-2
+# Share of a column below which what the model leaves of it is rounding, and no direction that views tell of.
+_EXPLAINED = 1e-9
 # Models beside further columns that are kept: those of one round of a selection, but of so many numbers in all at most:
 # 2,773 poses of a probe take 40 MB each.
 _REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
@@ -355,9 +357,11 @@ class LinearModel:
         return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
     def residual(self, columns: Array) -> Array:
-        """(n, P) whitened columns, what the model explains projected out."""
+        """(n, P) whitened columns, what the model explains projected out; zero where only rounding is left."""
         white = self.whiten(columns)
-        return white - self._explained @ (self._explained.T @ white)
+        left = white - self._explained @ (self._explained.T @ white)
+        left[:, np.sum(left**2, axis=0) <= _EXPLAINED**2 * np.sum(white**2, axis=0)] = 0.0
+        return left
 
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Yield I (P, P) and v (P,) per set of columns (n, P): the log likelihood of coefficients θ is vᵀθ − ½ θᵀIθ.
