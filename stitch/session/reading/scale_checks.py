@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch.errors import InputError, ScaleError
 from stitch.numerics.frames import Array
-from stitch.numerics.units import METRES
+from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.session import SessionData
 
 Limits = tuple[float, float]
@@ -29,7 +29,6 @@ _REACH_M = (0.03, 60.0)
 _MOTION_RATIO = 300.0
 # Fields of view over the working distance; a 1000 times less or more is another unit.
 _FIELD_SIZE = (2e-3, 30.0)
-_OTHER_UNIT = {"mm": "m", "m": "mm"}
 _LISTED_CLOUDS = 4
 
 
@@ -125,7 +124,9 @@ def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key:
         ScaleError: with the other unit as the fix.
     """
     if not _is_plausible(size_m, limits):
-        hint = f'the scale looks off by 1000: set {key} = "{_OTHER_UNIT[unit]}"'
+        factors = {other: CLOUD_METRES[other] / CLOUD_METRES[unit] for other in METRES if other != unit}
+        other, factor = (max if size_m < limits[0] else min)(factors.items(), key=lambda item: item[1])
+        hint = f'the scale looks off by {max(factor, 1 / factor):.4g}: set {key} = "{other}"'
         raise ScaleError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
 
 
