@@ -284,7 +284,8 @@ def test_another_unit_is_refused(right, factor):
         check_scale(moved(right, lambda points: points * factor), "mm")
 
 
-def test_a_size_that_no_centimetres_explain_is_refused_with_a_unit_that_may(right):
+def test_a_size_that_no_centimetres_explain_is_refused_with_a_unit_that_may(session):
+    right = load_session(session)
     with pytest.raises(InputError, match=r'cloud_unit = "cm"; the scale looks off by 100: set cloud_unit = "m"'):
         check_scale(moved(right, lambda points: points * 1e-4), "cm")
     with pytest.raises(InputError, match=r'cloud_unit = "inch"; the scale looks off by 25.4: set cloud_unit = "mm"'):
