@@ -295,7 +295,6 @@ def test_the_modes_hold_the_variance_and_the_correlation_of_what_the_simulator_d
     assert np.abs(modelled[0, 4:]).max() < 0.15 * errors.size**2
 
 
-@pytest.mark.slow  # two whole runs
 def test_the_order_of_the_views_changes_nothing(monkeypatch):
     scene = clean("spheres", rays=60, noise=0.02, scan_error=0.02, scan_error_length=0.2)
     session = session_of(simulated(replace(scene, repeatability=(15e-6, 0.01)), {}, 6, views=5))

@@ -16,8 +16,6 @@ def scans(_blade_on_disk, tmp_path):
     return folder
 
 
-# In `make test` step by step: stitch init, run and diagnose in their own files, jobs of the server in test_web_app.py.
-@pytest.mark.slow
 def test_scans_are_run_and_diagnosed_and_then_reviewed(scans, tmp_path):
     run = tmp_path / "run"
     with served(scans, "-o", run) as server:
