@@ -44,7 +44,7 @@ def into_datum(places: PlaceErrors, wanted: FeatureList) -> tuple[PlaceErrors, A
         size = float(np.ptp(np.vstack([fit.at.points for fit in fits]), axis=0).max())
         motions = answers_to_motion(slopes, fits, places.centre)[rows]
         _require_all_directions(motions, [quantities[q][1] for q in rows], size)
-        step: Array = np.linalg.solve(motions, (nominal - values)[rows])
+        step = np.asarray(np.linalg.solve(motions, (nominal - values)[rows]), np.float64)
         moved = frames.moved_about(places.centre, step, np.eye(4))
         places = _moved_places(places, moved)
         T = moved @ T
