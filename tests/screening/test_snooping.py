@@ -6,6 +6,7 @@ Where a scan closes among the others: at places that look alike, and together wi
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from stitch.screening.placement import (
     place_groups,
     place_scan,
 )
+from stitch.screening.plausibility import apply_displacement_limits
 from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.snooping import MisplacedView, snoop_views
 from stitch.session.scan import prepare_scan
@@ -65,6 +67,15 @@ def test_views_that_most_others_do_not_meet_stand_alone_and_groups_do_not(cell):
     assert alone(tuple(range(10)), (10,), (11,)) == (10, 11)
     assert alone(tuple(range(9)), (9, 10), (11,)) == ()
     assert alone((0, 1, 2), *((v,) for v in range(3, 12))) == ()
+
+
+@pytest.mark.parametrize(("at_least", "left_out"), [((0.0, 0.5), ()), ((0.0, 500.0), (3,)), ((0.5, 0.0), (3,))])
+def test_a_suspected_view_is_left_out_where_no_arm_errs_as_much(cell, at_least, left_out):
+    measured, own = cell
+    found = snoop_views(own, measured.T_mount, GATE)
+    suspected = MisplacedView(3, "displaced", *at_least, None, at_least)
+    judged = apply_displacement_limits(SimpleNamespace(length_unit="mm"), replace(found, suspected=(suspected,)))
+    assert judged.left_out == left_out and len(judged.suspected) == 1 - len(left_out)
 
 
 @pytest.mark.parametrize("shift", [1.0, pytest.param(40.0, marks=pytest.mark.slow)])
