@@ -15,7 +15,7 @@ from stitch.errors import NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.feature_file import Contribution, FeatureList
 from stitch.plugins.metrology.features import NUMBERS, Feature, FittedFeature, fit_feature, position_of, reach_of
-from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, RunPoints
+from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, RunPoints, twist_slopes
 from stitch.system.values import Table
 
 # The variances are posterior means, which hold already that they are not well known: twice their root covers 95 %
@@ -281,11 +281,7 @@ def free_of_datum(slopes: Array, fits: Sequence[FittedFeature], centre: Array, r
 
 def answers_to_motion(slopes: Array, fits: Sequence[FittedFeature], centre: Array) -> Array:
     """Return the change (Q, 6) of numbers with a motion of the part about a centre (3,): turn in rad, then shift."""
-    of_fits = [
-        np.hstack([np.cross(fit.at.points - centre, fit.gradient).sum(axis=1), fit.gradient.sum(axis=1)])
-        for fit in fits
-    ]
-    return slopes @ np.vstack(of_fits)
+    return slopes @ np.vstack([twist_slopes(fit.at.points - centre, fit.gradient) for fit in fits])
 
 
 def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, Array]:

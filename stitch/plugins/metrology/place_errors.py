@@ -83,8 +83,7 @@ class PlaceErrors:
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
             g = gradient[:, of_view]
-            views[:, v, :3] = np.cross(at.points[of_view] - self.centre, g).sum(axis=1)
-            views[:, v, 3:] = g.sum(axis=1)
+            views[:, v] = twist_slopes(at.points[of_view] - self.centre, g)
             index = at.index[of_view]
             g_scanner = frames.rotate(frames.inverse(self.poses[v]), g)
             shapes += np.einsum("qni,kni->qk", g_scanner, self.point_modes(v, index))
@@ -136,6 +135,15 @@ class PlaceErrors:
         scan = self.capture.scans[v]
         away = scan.points[index] - scan.eye
         return away / np.linalg.norm(away, axis=1)[:, None], self.scan_errors.along(away)
+
+
+def twist_slopes(arms: Array, gradient: Array) -> Array:
+    """Return (q, 6): Σ [arm × slope, slope], what a left twist of N points does to numbers with slopes (q, N, 3).
+
+    Args:
+        arms: (N, 3) from the point that the twist turns about to each point, the frame of the slopes.
+    """
+    return np.hstack([np.cross(arms, gradient).sum(axis=1), gradient.sum(axis=1)])
 
 
 def point_sigmas(places: PlaceErrors, cloud: FusedCloud) -> Array:
