@@ -6,7 +6,7 @@ run's steps goes on beside the screening is started here, by `_Conductor`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import closing
 from dataclasses import replace
@@ -14,10 +14,8 @@ from functools import partial
 from threading import Event
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from stitch.effects.contract import find_effect, parameters_in, require_available
-from stitch.errors import InputError, NoResultError
+from stitch.api.rig import require_effects, require_measured_once, require_same_arm, require_same_rig
+from stitch.errors import NoResultError
 from stitch.fit.coarse import COARSE_GATE, REUSED, CoarseHandEye
 from stitch.fit.coarse_axes import locate_axes
 from stitch.fit.correct import Correction
@@ -43,9 +41,8 @@ from stitch.screening.hand_eye_anywhere import hand_eye_sigma_anywhere
 from stitch.screening.hand_eye_transfer import hand_eye_transfer
 from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
-from stitch.session.axis_poses import axis_tables
 from stitch.session.capture import Capture, part_size, prepare_capture
-from stitch.session.measurement import Measurement, measurement_of, require_rising_times, with_part_origin
+from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 from stitch.session.notes import session_notes
 from stitch.session.scanners import join_sessions
 from stitch.session.session import SessionData
@@ -54,9 +51,6 @@ from stitch.system.threads import Clock, begin, library_threads_off
 # A run loads nothing of the diagnosis.
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import Diagnosis
-
-# No two measured scans begin with so many points alike.
-_COMPARED_POINTS = 100
 
 
 def run(
@@ -122,10 +116,8 @@ def run_rig(
         asked = [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())]
         sessions, measurements = _measured(sessions, captures, asked)
         require_measured_once(sessions)
-        hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
-        measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
+        hand_eyes, measurements = _start_hand_eyes(sessions, measurements, model)
         seconds = clock.lap()
-        # Results of the coarse stage, one a session.
         coarse = []
         for session, measurement, hand_eye, recorder in zip(sessions, measurements, hand_eyes, recorders, strict=True):
             with refuse_explained_mistake(session):
@@ -134,20 +126,30 @@ def run_rig(
         with closing(_Conductor(sessions, start, coarse, recorders, register)) as conductor:
             # Fits again whenever it leaves views out; the views are registered and fused meanwhile.
             screened = fit_screened_views(sessions, measurements, conductor.fit, keep)
-            if model:
-                check = _check_given_hand_eye if sessions[0].has_clouds else _check_against_own_model
-                screened = check(screened, effects, model)
+            if model and sessions[0].has_clouds:
+                screened = _check_given_hand_eye(screened)
+            elif model:
+                screened = _check_against_own_model(screened, effects, model)
             notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
-            fits = conductor.finish()
+            finished = conductor.finish()
         alone = () if model else _each_alone(screened.sessions[0], arm)
         runs = []
         for i, screening in enumerate(screened.screenings):
-            order = sessions[i].names
-            left_out = tuple(sorted(screening.left_out, key=lambda item: order.index(item.view)))
-            screening = replace(screening, left_out=left_out, doubts=(*doubts, *screening.doubts))
-            session = screened.sessions[i]
-            run = _assemble_run(session, i, screened.fitted, hand_eyes[i], fits[i], screening, keep=keep, notes=notes)
-            runs.append(_with_alone(replace(run, effects_file=model.effects_file if model else None), alone))
+            names = sessions[i].names
+            left_out = sorted(screening.left_out, key=lambda item: names.index(item.view))
+            screening = replace(screening, left_out=tuple(left_out), doubts=(*doubts, *screening.doubts))
+            run = _assemble_run(
+                screened.sessions[i],
+                i,
+                screened.fitted,
+                hand_eyes[i],
+                finished[i],
+                screening,
+                keep=keep,
+                notes=notes,
+                alone=alone,
+            )
+            runs.append(replace(run, effects_file=model.effects_file if model else None))
         for run, recorder in zip(runs, recorders, strict=True):
             recorder.finish(run)
         return runs
@@ -174,7 +176,7 @@ def join_scanners(
     require_same_rig(sessions, model)
     require_measured_once(sessions)
     for session in sessions[1:]:
-        _require_same_arm(sessions[0], session)
+        require_same_arm(sessions[0], session)
     if model:
         return join_sessions(with_model_scanners(sessions, convert_unit(model, sessions[0].length_unit)))
     with library_threads_off():
@@ -211,15 +213,30 @@ def _measured(
     return locate_axes(sessions, measurements) if sessions[0].axes else (sessions, measurements)
 
 
+def _start_hand_eyes(
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], model: ModelFile | None
+) -> tuple[list[CoarseHandEye], list[Measurement]]:
+    """Return the hand-eye with which the fit of each session begins, and the measurements with the part's origin.
+
+    Args:
+        model: hand-eye of another run, used as it is; None: the one that the session states, or a search.
+
+    Raises:
+        NoResultError: no hand-eye was found.
+    """
+    hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
+    placed = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
+    return hand_eyes, placed
+
+
 def _fit_alone(session: SessionData, measurement: Measurement, arm: ModelFile | None) -> Correction:
     """Return the hand-eye of one session corrected from its own views, the effects of `arm` staying as they are.
 
     Raises:
         NoResultError: the views give no hand-eye, or do not overlap.
     """
-    hand_eyes = pipeline_for(session).start([session], [measurement], None)
-    measurement = with_part_origin(measurement, hand_eyes[0].T_mount)
-    correction = _fit_unseen([session], [measurement], hand_eyes, (), arm).correction
+    hand_eyes, measurements = _start_hand_eyes([session], [measurement], None)
+    correction = _fit_unseen([session], measurements, hand_eyes, (), arm).correction
     assert correction is not None
     return correction
 
@@ -261,117 +278,6 @@ def _each_alone(session: SessionData, arm: ModelFile | None) -> tuple[ScannerAlo
     return tuple(found)
 
 
-def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
-    """Refuse sessions that cannot share a rig: its mount, length unit, model, kind of data, and external axes.
-
-    Each session by itself also needs something measured, two views, and times that never decrease.
-
-    Raises:
-        InputError: names the session and what is wrong.
-    """
-    first = sessions[0]
-    for other in sessions[1:]:
-        if (other.mount, other.length_unit) != (first.mount, first.length_unit):
-            raise InputError(
-                f"{other.path}: mount {other.mount} in {other.length_unit}, but {first.path} has {first.mount} "
-                f"in {first.length_unit}; only sessions of one rig share a hand-eye"
-            )
-    if model and model.mount != first.mount:
-        raise InputError(
-            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
-        )
-    if model and model.scanners and len(sessions) == 1 and not first.parts:
-        raise InputError(
-            f"{first.path}: one session, but the model has the hand-eyes of {', '.join(model.scanners)}; to fix: name "
-            "the folder of this session within that run (--hand-eye RUN/SESSION)"
-        )
-    for session in sessions:
-        require_rising_times(session)
-        if not session.has_clouds and not session.has_sightings:
-            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
-        if session.has_clouds != first.has_clouds:
-            clouds, points = (first, session) if first.has_clouds else (session, first)
-            raise InputError(
-                f"{clouds.path} has clouds and {points.path} labelled points alone; to fix: run them apart, one with "
-                "the model of the other (--hand-eye, --arm)"
-            )
-        if not session.has_clouds:
-            _require_same_arm(first, session)
-        if session is not first and (session.has_poses, axis_tables(session)) != (first.has_poses, axis_tables(first)):
-            raise InputError(
-                f"{session.path}: its [[axis]] tables are not those of {first.path}; to fix: state the same axes, at "
-                "the same place, in all sessions of a rig"
-            )
-        if len(session.views) < 2:
-            raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
-
-
-def _require_same_arm(first: SessionData, other: SessionData) -> None:
-    """Refuse two sessions whose robots differ in their kinematics; masses may differ, and one may state no robot.
-
-    Raises:
-        InputError: another number of joints, or other transforms before, after or zero angles of them.
-    """
-    a, b = first.robot, other.robot
-    if a is None or b is None:
-        return
-    same_size = a.n_joints == b.n_joints
-    if not (
-        same_size
-        and np.allclose(a.before, b.before)
-        and np.allclose(a.after, b.after)
-        and np.allclose(a.theta, b.theta)
-    ):
-        raise InputError(
-            f"{other.path}: its [robot] is another arm than that of {first.path}; only sessions of one arm share its "
-            "effects; to fix: state the same rows, or run them apart"
-        )
-
-
-def require_measured_once(sessions: Sequence[SessionData]) -> None:
-    """Refuse a scan that stands in two sessions: it would count as two, and the hand-eye seem surer than it is.
-
-    Raises:
-        InputError: names both sessions and views.
-    """
-    # Session and view by the bytes of the scan's first points. Within one session a repeated scan is not refused here.
-    known: dict[bytes, tuple[SessionData, str]] = {}
-    for session in sessions:
-        clouds = {
-            view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()
-            for view in session.views
-            if view.cloud is not None
-        }
-        for name, points in clouds.items():
-            if points in known:
-                other, view = known[points]
-                raise InputError(
-                    f"{session.path}: the scan of view {name} is that of view {view} in {other.path}, measured once "
-                    "and given twice; to fix: name each session once"
-                )
-        known |= {points: (session, name) for name, points in clouds.items()}
-
-
-def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:
-    """Refuse effects that a session cannot have, or that have other parameters in another session of the rig.
-
-    Raises:
-        InputError: names the effect, the session and what is missing or different.
-    """
-    for effect in map(find_effect, effects):
-        for measurement in measurements:
-            require_available(measurement, effect)
-        # One value of each parameter is fitted to all sessions.
-        parameters = [{f"{p.name} ({p.unit})" for p in parameters_in(m, effect)} for m in measurements]
-        for measurement, names in zip(measurements, parameters, strict=True):
-            if names != parameters[0]:
-                raise InputError(
-                    f"effect {effect.name}: sessions {measurements[0].capture.name} and {measurement.capture.name} "
-                    f"do not share {', '.join(sorted(parameters[0] ^ names))}; give both the same arm, link masses and "
-                    "temperatures, or run them apart"
-                )
-
-
 def _show_coarse_stage(
     session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
 ) -> StageResult:
@@ -404,11 +310,10 @@ def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile 
 
 
 class _Conductor:
-    """Fits the sessions of a rig, and lets their last steps go on while the views are screened.
+    """Fits the sessions of a rig, and registers and fuses their views in other threads while they are screened.
 
-    Nearly always all views belong: they are registered and fused meanwhile. The statistics of the hand-eye, half a
-    second of one core, have a thread of their own. What was begun for views that are then left out ends with its next
-    iteration.
+    Nearly always all views belong, and the work is not in vain. What was begun for views that are then left out ends
+    with its next iteration.
     """
 
     def __init__(
@@ -435,44 +340,52 @@ class _Conductor:
         self._register = register
         self._clock = Clock()
         self._seconds = 0.0
-        self._memories: list[RecorderMemory] = []  # of the sessions under way
-        self._screened = Event()
+        self._memories: list[RecorderMemory] = []  # one a session, of the thread that registers now
+        self._screened = Event()  # set when the screening is over, and when the thread is to stop
 
     def fit(self, sessions: Sequence[SessionData], measurements: Sequence[Measurement]) -> FittedRig:
         """Return the fit of these views, and begin in other threads to register and to fuse them.
 
         The screening calls this again each time it leaves views out; what was begun before is then stopped. This
-        thread fits. One further thread registers the views; before it reads whole clouds to fuse them, it waits until
-        `finish` sets the event `screened`. Another computes the hand-eye's covariance. A RecorderMemory stores the
-        registering thread's calls, and `finish` replays them: views that are left out later are never shown.
+        thread fits. One further thread registers and fuses the views, another computes the hand-eye's covariance.
         """
         self.close()
         # A recorder that was told of a session with more views starts again.
         for whole, session, recorder in zip(self._sessions, sessions, self._recorders, strict=True):
             if len(session.views) < len(whole.views):
                 recorder.start(session)
-        steps = pipeline_for(sessions[0])
-        fitted = steps.fit(sessions, measurements, self._start, self._recorders[0])
+        fitted = pipeline_for(sessions[0]).fit(sessions, measurements, self._start, self._recorders[0])
         self._seconds += self._clock.lap()
-        memories = self._memories = [RecorderMemory() for _ in sessions]
-        screened = self._screened = Event()
-
-        # Called by the registering thread before fusion; the names are local, since a later `fit` replaces the fields.
-        def until_screened() -> None:
-            screened.wait()
-            if memories[0].stopped:
-                raise CancelledError
-
-        of_session = partial(steps.finish, seconds=self._seconds, method=self._register, until_screened=until_screened)
-
-        def finish() -> list[tuple[Fit, float]]:
-            every = enumerate(zip(sessions, self._coarse, memories, strict=True))
-            return [of_session(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
-
+        self._memories = [RecorderMemory() for _ in sessions]
+        self._screened = Event()
+        until_screened = partial(_wait_until_screened, self._screened, self._memories[0])
+        # The thread gets what it works with as arguments, since a later call of `fit` replaces the fields.
+        arguments = sessions, fitted, self._memories, self._seconds, until_screened
+        self._finished = begin(partial(self._register_and_fuse, *arguments))
         # `hand_eye` is a cached property: read here, it is at hand when the run is assembled.
         self._statistics = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
-        self._finished = begin(finish)
         return fitted
+
+    def _register_and_fuse(
+        self,
+        sessions: Sequence[SessionData],
+        fitted: FittedRig,
+        memories: Sequence[RecorderMemory],
+        seconds: float,
+        until_screened: Callable[[], None],
+    ) -> list[tuple[Fit, float]]:
+        """Return, a session each, what the stages after the fit found and the rms that perfect poses would leave.
+
+        Args:
+            fitted: hand-eye and effects of the whole rig.
+            memories: one a session; they store what `finish` replays, so that views left out later are never shown.
+            seconds: time that the fit has taken.
+            until_screened: called before whole clouds are read to fuse them, see `_wait_until_screened`.
+        """
+        steps = pipeline_for(sessions[0])
+        finish = partial(steps.finish, seconds=seconds, method=self._register, until_screened=until_screened)
+        every = enumerate(zip(sessions, self._coarse, memories, strict=True))
+        return [finish(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
 
     def finish(self) -> list[tuple[Fit, float]]:
         """Return, a session each, what the stages found and the rms that perfect poses would leave (length_unit).
@@ -493,11 +406,21 @@ class _Conductor:
         self._screened.set()
 
 
-def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
+def _wait_until_screened(screened: Event, memory: RecorderMemory) -> None:
+    """Wait until the views are screened.
+
+    Raises:
+        CancelledError: views were left out meanwhile, and the memory's calls are not needed.
+    """
+    screened.wait()
+    if memory.stopped:
+        raise CancelledError
+
+
+def _check_given_hand_eye(screened: ScreenedFit) -> ScreenedFit:
     """Return the fit with, for each session, how far the hand-eye of another run lies from what its scans show.
 
-    Where the two contradict each other, the session gets a doubt. `effects` and `model` are not needed here: the
-    function is called in the same place as `_check_against_own_model`.
+    Where the two contradict each other, the session gets a doubt.
     """
     correction = screened.fitted.correction
     assert correction is not None
@@ -517,13 +440,14 @@ def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], mode
     The comparison is a fit of hand-eye and targets from these points themselves, with the arm's effects of `model`. It
     is made only when the check asks for it.
     """
-    seen = screened.sessions, screened.measurements
+    sessions, measurements = screened.sessions, screened.measurements
 
     def fit() -> FittedRig:
-        hand_eyes = pipeline_for(screened.sessions[0]).start(*seen, None)
-        return _fit_unseen(*seen, hand_eyes, effects, arm_model(model))
+        """Return the fit of these points themselves."""
+        hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, None)
+        return _fit_unseen(sessions, measurements, hand_eyes, effects, arm_model(model))
 
-    return screened.with_doubts(check_model_transfer(screened.sessions, screened.fitted, fit))
+    return screened.with_doubts(check_model_transfer(sessions, screened.fitted, fit))
 
 
 def _check_common_model(
@@ -584,6 +508,7 @@ def _assemble_run(
     *,
     keep: bool = False,
     notes: tuple[str, ...] = (),
+    alone: tuple[ScannerAlone, ...] = (),
 ) -> RunData:
     """Return the run of one session of a rig: its fit and screening put together, with the first step of its ledger.
 
@@ -595,31 +520,25 @@ def _assemble_run(
         screening: which of its views belong, and what is to be doubted.
         keep: views that do not belong were fused all the same: they are noted as kept, and none as left out.
         notes: sentences on what the sessions share.
+        alone: of several scanners, the hand-eye of each from its own views; where they contradict the common fit, the
+            run gets doubts.
     """
     fit, noise_floor = finished
     model = fitted.model_of(index)
     left_out, kept = ((), screening.left_out) if keep else (screening.left_out, ())
     notes_on_views = view_notes(left_out, kept, screening.suspected)
     notes_on_fit = pipeline_for(session).notes(session, fitted, index, start)
-    # Scans of all sessions show the one hand-eye that they share; labelled points have one for each session.
-    captures = fitted.captures if session.has_clouds else [fitted.captures[index]]
-    # Where several sessions share a hand-eye no joint has one place for all.
-    joints = session.joints if len(captures) == 1 else None
     fit = replace(
-        fit,
+        _with_hand_eye_limits(fit, session, index, fitted, start),
         targets=fitted.sessions[index].targets,
         outliers=fitted.sessions[index].outliers,
-        unobservable=unobservable(captures, model.T_mount, session.robot, joints),
-        # A hand-eye of another run is as well known as it was there.
-        unknown=() if start.source == REUSED else unknown_numbers(captures, model.T_mount),
         notes=(*notes_on_views, *notes_on_fit, *session_notes(session), *notes),
-        sigma_anywhere=None if start.source == REUSED else _sigma_anywhere(fitted, index),
     )
     residual_rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
     heldout_rms = fitted.heldout_rms(index)
     values = {term.name: {p.name: p.value for p in term.parameters} for term in model.terms}
     first_step = LedgerStep(tuple(model.effects), residual_rms, heldout_rms, noise_floor, model.T_mount, values)
-    return RunData(
+    run = RunData(
         session=session,
         measurement=fitted.sessions[index].measurement,
         model=model,
@@ -634,20 +553,31 @@ def _assemble_run(
         doubts=screening.doubts,
         left_out=left_out,
         links=screening.links,
+        alone=alone,
         hand_eye_transfer=screening.hand_eye,
     )
+    if session.parts:
+        run = replace(run, doubts=(*run.doubts, *contradictions(run.scanners, session.length_unit)))
+    return run
 
 
-def _with_alone(run: RunData, alone: tuple[ScannerAlone, ...]) -> RunData:
-    """Return the run with the hand-eye of each scanner alone, and doubts where these contradict the common fit.
+def _with_hand_eye_limits(fit: Fit, session: SessionData, index: int, fitted: FittedRig, start: CoarseHandEye) -> Fit:
+    """Return a fit with what its views do not show of the hand-eye: directions, numbers, and sigma anywhere.
 
-    A run of one scanner is returned as it is.
+    Args:
+        index: of the session in the rig.
+        fitted: hand-eye and effects of the whole rig.
+        start: the hand-eye before the correction; that of another run is as well known as it was there.
     """
-    if not run.session.parts:
-        return run
-    run = replace(run, alone=alone)
-    doubts = contradictions(run.scanners, run.session.length_unit)
-    return replace(run, doubts=(*run.doubts, *doubts))
+    T_mount = fitted.model_of(index).T_mount
+    # Scans of all sessions show the one hand-eye that they share; labelled points have one for each session.
+    captures = fitted.captures if session.has_clouds else [fitted.captures[index]]
+    # Where several sessions share a hand-eye no joint has one place for all.
+    joints = session.joints if len(captures) == 1 else None
+    fit = replace(fit, unobservable=unobservable(captures, T_mount, session.robot, joints))
+    if start.source == REUSED:
+        return fit
+    return replace(fit, unknown=unknown_numbers(captures, T_mount), sigma_anywhere=_sigma_anywhere(fitted, index))
 
 
 def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
@@ -683,9 +613,8 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
             warnings = session_warnings(session, fitted.sessions[0].measurement, fitted.correction, 0)
             (finished,) = conductor.finish()
         screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
-        run = _assemble_run(session, 0, fitted, hand_eye, finished, screening)
+        run = _assemble_run(session, 0, fitted, hand_eye, finished, screening, alone=state.alone)
         run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
-        run = _with_alone(run, state.alone)
         recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}
         return replace(run, tried=tried)

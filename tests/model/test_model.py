@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.edits import edit
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, flange, joints_of, labelled_cell
-from stitch.api.pipeline import require_effects, run, run_rig
+from stitch.api.pipeline import run, run_rig
+from stitch.api.rig import require_effects
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need, parameters_in
 from stitch.errors import InputError
