@@ -31,9 +31,10 @@ class StitchError(Exception):
 
     def __init__(self, message: str = "", *, fix_cli: str = "", fix_python: str = "") -> None:
         super().__init__(message)
-        self.what, _, fix = message.partition(_TO_FIX)
-        self.fix_cli = fix_cli or fix or fix_python
-        self.fix_python = fix_python or fix or fix_cli
+        what, _, fix = message.partition(_TO_FIX)
+        self.what: str = what
+        self.fix_cli: str = fix_cli or fix or fix_python
+        self.fix_python: str = fix_python or fix or fix_cli
 
     @property
     def command_line(self) -> str:

@@ -132,7 +132,7 @@ class LiveSession:
         self, session: Session, recording: LiveRecording | None = None, cloud_unit: LengthUnit | None = None
     ) -> None:
         """Begin with the views that the session has; `cloud_unit` is that of clouds which are given as arrays."""
-        self.session = session  # with the views so far
+        self.session: Session = session  # with the views so far
         self.said: list[LiveView] = []  # of every view, in their order
         self._recording = recording
         self._cloud_unit = cloud_unit

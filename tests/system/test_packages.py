@@ -4,6 +4,7 @@ Open3D is imported light, leaves the whole of it to whoever asks for that, and s
 """
 
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -12,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import stitch
+from bench.docs.page_blocks import refused
 from bench.licences import brought, complaints, kind, licence
 from stitch.api.run import Stitched
 from stitch.errors import InputError
@@ -153,6 +156,21 @@ def test_the_image_is_made_by_the_commands_of_the_readme():
     )[:2]
     image = (ROOT / "examples/fleet/Dockerfile").read_text("utf-8")
     assert f"\nRUN {command}" in image and f"PATH=/stitch/{environment[2:].removesuffix('/activate')}:" in image
+
+
+def test_the_services_of_the_compose_file_are_commands_with_options_that_exist():
+    pytest.importorskip("distributed")
+    place = ROOT / "examples/fleet"
+    services = yaml.safe_load((place / "compose.yaml").read_text("utf-8"))["services"]
+    for service in services.values():
+        build = service["build"]
+        assert (place / build["context"] / build["dockerfile"]).is_file()
+        if "command" in service:
+            assert refused(shlex.join(["stitch", *service["command"]])) is None
+        else:
+            _, name, *options = service["entrypoint"]
+            (command,) = entry_points(group="dask_cli", name=name)
+            command.load().make_context(name, options)
 
 
 def test_open3d_is_no_dependency_of_the_base():

@@ -11,6 +11,7 @@ import stitch
 from stitch.api.live import LiveView
 from stitch.numerics import frames
 from stitch.plugins.intake.ros_bag import TransformTree, cloud_array, message_time, transform_recording
+from stitch.session.session import Mount
 
 # The flange stands if it turns (rad) and shifts (m) by less within so long (s) before and after a scan.
 _TURN, _SHIFT, _AROUND = 1e-3, 5e-4, 0.25
@@ -22,7 +23,7 @@ _MEMORY = 10.0  # s of transforms that are kept
 class LiveCell:
     """Session of a cell that grows by one view for each stop of the arm; lengths in m."""
 
-    def __init__(self, base: str, flange: str, mount: str = "eye_in_hand") -> None:
+    def __init__(self, base: str, flange: str, mount: Mount = "eye_in_hand") -> None:
         self.base, self.flange, self.mount = base, flange, mount
         self.scanner = ""  # frame of the clouds
         self.live = stitch.live(mount=mount, unit="m", name="ros")
