@@ -12,7 +12,7 @@ import rerun as rr
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts, posterior_text
 from stitch.numerics.units import MICROMETRES
-from stitch.output.plain_finding import plain_finding, remedy_at_machine, suggested_command
+from stitch.output.plain_finding import next_step_line, plain_finding, remedy_at_machine
 from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
@@ -71,7 +71,7 @@ def log_diagnosis(
     proof = [] if screen is None else [screen["proof"], f"How sure: {screen['certainty']}", remedy_at_machine(found)]
     rec.log("diagnosis/plain", words("\n\n".join([f"**{plain}**", *proof])), static=True)
     courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]
-    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{suggested_command(found, 'RUN')}", ""]
+    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{next_step_line(found, 'RUN')}", ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
         "|---:|---|---:|---:|---:|---|",

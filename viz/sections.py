@@ -16,11 +16,11 @@ from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
 from stitch.output.finding_screen import effects_tried, finding_screen
 from stitch.output.plain_finding import (
-    command_without_a_view,
     largest_error_sources,
+    next_step_line,
+    next_step_without_a_view,
     plain_finding,
     remedy_at_machine,
-    suggested_command,
 )
 from stitch.output.plain_words import effect_description
 from stitch.run_data import RunData
@@ -140,7 +140,7 @@ def _in_um(value: float, unit: str) -> str:
 
 
 def _next(found: Diagnosis, run: str) -> str:
-    why, command = suggested_command(found, shlex.quote(run)).rsplit(": ", 1)
+    why, command = next_step_line(found, shlex.quote(run)).rsplit(": ", 1)
     said = "Type, where the folder of this page stands" if why == "Next" else _purpose(why)
     poses = [proposal for proposal in found.next if proposal.probability is not None]
     scan = instead = ""
@@ -148,7 +148,7 @@ def _next(found: Diagnosis, run: str) -> str:
         odds = f"with a probability of {poses[0].probability:.0%}: {poses[0].do}. {NOT_IN_ODDS}"
         said = f"The view that decides {deciding_words(found)}, {odds} Its robot program"
         scan = "<p>Scan there, add scan and row to the session, and run it again.</p>"
-        why_now, now = command_without_a_view(found, shlex.quote(run)).rsplit(": ", 1)
+        why_now, now = next_step_without_a_view(found, shlex.quote(run)).rsplit(": ", 1)
         instead = "" if now.startswith("stitch next") else f"<p>No time? {_words(_purpose(why_now))}:</p>{_typed(now)}"
     does = _DOES.get(command.split()[1], "")
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)

@@ -32,7 +32,7 @@ from stitch.recorder import Recorder, SilentRecorder
 from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
 from stitch.screening.view_model import UsualEffects, ViewModel, view_model
 from stitch.screening.view_screening import fit_screened_views
-from stitch.session.axis_poses import axes_of, place_axes, place_stated_axes, require_placed
+from stitch.session.axis_poses import axes_of, place_axes, place_stated_axes, require_placed, require_readings
 from stitch.session.capture import Capture, build_capture, prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_toml import read_axes
@@ -202,13 +202,7 @@ class LiveSession:
         cell = self.session
         if not cell.axes:
             return view
-        # An axis may be read in one of several units, each a column of its own.
-        for axis in cell.axes:
-            if not set(axis.columns(cell.length_unit)) & set(view.covariates):
-                column = " or ".join(axis.columns(cell.length_unit))
-                raise InputError(
-                    f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with {column}"
-                )
+        require_readings([view], cell.axes, cell.length_unit)
         return place_axes(replace(cell, axes=(), views=(view,)), cell.axes).views[0]
 
     def take(self, view: View) -> LiveView:
@@ -575,9 +569,6 @@ def _as_reported(proposed: ProposedPose, session: SessionData) -> ProposedPose:
 def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) -> ProposedPose:
     """Return the pose that would reduce the hand-eye's U most, among all poses taken, each turned about the part.
 
-    Each view v measures its pose with the same unit precision; J_v is that pose's derivative by the hand-eye. With
-    J̄ the mean over the views, the information is Σ (J_v − J̄)ᵀ (J_v − J̄). Only the ratio of two U is used.
-
     Args:
         live_fit: the views in the fit and their hand-eye.
         views: those views, in the order of the fit.
@@ -594,28 +585,32 @@ def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) ->
     # Both (·, 6, 6): left twist of a view about the centre per right twist of the hand-eye.
     jacobians_taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
     jacobians_proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
-    # Rotations count as the displacements that they make at the lever.
-    unit = np.array([gram.lever] * 3 + [1.0] * 3)[:, None]
-
-    def relative_uncertainty(jacobians: Array) -> float:
-        """Return U of the hand-eye at the part, up to a common factor.
-
-        The mean is subtracted, since a motion of all views together leaves their overlaps unchanged.
-
-        Args:
-            jacobians: (V, 6, 6) left twist of each view about the part's centre per right twist of the hand-eye.
-        """
-        deviations = unit * (jacobians - jacobians.mean(axis=0))
-        information = np.einsum("vki,vkj->ij", deviations, deviations)
-        # A weak prior keeps the information invertible: a direction that no view shows yet gets a large variance.
-        weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
-        return displacement(np.linalg.inv(information + weak), hand_eye.middle)
-
-    with_pose = [relative_uncertainty(np.concatenate([jacobians_taken, J[None]])) for J in jacobians_proposed]
+    relative_U = partial(_relative_uncertainty, lever=gram.lever, middle=hand_eye.middle)
+    with_pose = [relative_U(np.concatenate([jacobians_taken, J[None]])) for J in jacobians_proposed]
     best = int(np.argmin(with_pose))
     view = views[best // len(turns)]
     # A fixed scanner sees the part on the flange: the reference is the flange then, and the mount the base.
     T_base_flange = poses[best] if hand_eye.frame == "flange" else frames.inverse(poses[best])
     turn_deg = Rotation.from_matrix(T_base_flange[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
-    U_mm = hand_eye.U.mm * with_pose[best] / relative_uncertainty(jacobians_taken)
+    U_mm = hand_eye.U.mm * with_pose[best] / relative_U(jacobians_taken)
     return ProposedPose(T_base_flange, view.name, turn_deg, U_mm)
+
+
+def _relative_uncertainty(jacobians: Array, *, lever: float, middle: Array) -> float:
+    """Return U of the hand-eye at the part, up to a factor that is common to all sets of views.
+
+    Each view v is assumed to measure its pose with the same precision; J_v is that pose's derivative by the hand-eye.
+    The information is Σ (J_v − J̄)ᵀ (J_v − J̄) with the mean J̄ over the views, since a motion of all views together
+    leaves their overlaps unchanged.
+
+    Args:
+        jacobians: (V, 6, 6) left twist of each view about the part's centre per right twist of the hand-eye.
+        lever: length_unit: rotations count as the displacements that they make at this distance.
+        middle: (3,) of the part, scanner frame, length_unit.
+    """
+    unit = np.array([lever] * 3 + [1.0] * 3)[:, None]
+    deviations = unit * (jacobians - jacobians.mean(axis=0))
+    information = np.einsum("vki,vkj->ij", deviations, deviations)
+    # A weak prior keeps the information invertible: a direction that no view shows yet gets a large variance.
+    weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
+    return displacement(np.linalg.inv(information + weak), middle)

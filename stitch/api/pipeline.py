@@ -138,16 +138,9 @@ def run_rig(
             names = sessions[i].names
             left_out = sorted(screening.left_out, key=lambda item: names.index(item.view))
             screening = replace(screening, left_out=tuple(left_out), doubts=(*doubts, *screening.doubts))
+            session, fitted = screened.sessions[i], screened.fitted
             run = _assemble_run(
-                screened.sessions[i],
-                i,
-                screened.fitted,
-                hand_eyes[i],
-                finished[i],
-                screening,
-                keep=keep,
-                notes=notes,
-                alone=alone,
+                session, i, fitted, hand_eyes[i], finished[i], screening, keep=keep, notes=notes, alone=alone
             )
             runs.append(replace(run, effects_file=model.effects_file if model else None))
         for run, recorder in zip(runs, recorders, strict=True):
@@ -469,12 +462,10 @@ def _check_common_model(
     def fit_session(i: int) -> FittedRig:
         return _fit_unseen([sessions[i]], [measurements[i]], [hand_eyes[i]], effects, arm)
 
-    def fit_with_arm(other: ModelFile | None) -> FittedRig:
-        return _fit_unseen(sessions, measurements, hand_eyes, effects, other)
-
     if len(sessions) > 1 and effects:
         doubts = find_disagreeing_sessions([s.name for s in sessions], screened.fitted, fit_session, unit)
     if arm:
+        fit_with_arm = partial(_fit_unseen, sessions, measurements, hand_eyes, effects)
         holds, sentence = check_arm_transfer(fit_with_arm, arm, screened.fitted, unit)
         if holds:
             notes = (sentence,)

@@ -69,12 +69,8 @@ def require_same_arm(first: SessionData, other: SessionData) -> None:
     a, b = first.robot, other.robot
     if a is None or b is None:
         return
-    same_size = a.n_joints == b.n_joints
-    if not (
-        same_size
-        and np.allclose(a.before, b.before)
-        and np.allclose(a.after, b.after)
-        and np.allclose(a.theta, b.theta)
+    if a.n_joints != b.n_joints or not all(
+        np.allclose(getattr(a, name), getattr(b, name)) for name in ("before", "after", "theta")
     ):
         raise InputError(
             f"{other.path}: its [robot] is another arm than that of {first.path}; only sessions of one arm share its "
@@ -91,19 +87,16 @@ def require_measured_once(sessions: Sequence[SessionData]) -> None:
     # Session and view by the bytes of the scan's first points. Within one session a repeated scan is not refused here.
     known: dict[bytes, tuple[SessionData, str]] = {}
     for session in sessions:
-        clouds = {
-            view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()
-            for view in session.views
-            if view.cloud is not None
-        }
-        for name, points in clouds.items():
+        clouds = [(view.name, view.cloud) for view in session.views if view.cloud is not None]
+        begins = {cloud.points[:_COMPARED_POINTS].tobytes(): name for name, cloud in clouds}
+        for points, name in begins.items():
             if points in known:
                 other, view = known[points]
                 raise InputError(
                     f"{session.path}: the scan of view {name} is that of view {view} in {other.path}, measured once "
                     "and given twice; to fix: name each session once"
                 )
-        known |= {points: (session, name) for name, points in clouds.items()}
+        known |= {points: (session, name) for points, name in begins.items()}
 
 
 def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:

@@ -115,7 +115,6 @@ def fitted_hand_eye(
         covariance: (6, 6) of T_mount·exp(ξ), scanner frame, rotation first; rad and length_unit.
         unknown: of x, y, z, rx, ry, rz: what the views do not show.
     """
-    # Mean over the views of the centroid of each, scanner frame.
     part_centre = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
     frame = "base" if session.mount == "eye_to_hand" else "flange"
     return FittedHandEye(T_mount, covariance, frame, session.length_unit, part_centre, unknown)
@@ -450,17 +449,17 @@ def _save_session_of_run(session: Session, folder: Path) -> Path:
     Raises:
         InputError: another session lies there.
     """
-    beside = folder.with_name(f"{folder.name}-session")
-    if not (beside / "session.toml").is_file():
-        return session.save(beside).path
-    with TemporaryDirectory(dir=beside.parent, prefix=f".{beside.name}.") as scratch:
-        again = session.save(Path(scratch) / beside.name).path
-        same = content_hash(again, measured_files(again)) == content_hash(beside, measured_files(beside))
+    saved = folder.with_name(f"{folder.name}-session")
+    if not (saved / "session.toml").is_file():
+        return session.save(saved).path
+    with TemporaryDirectory(dir=saved.parent, prefix=f".{saved.name}.") as scratch:
+        again = session.save(Path(scratch) / saved.name).path
+        same = content_hash(again, measured_files(again)) == content_hash(saved, measured_files(saved))
     if not same:
         raise InputError(
-            f"{beside}: holds another session; to fix: save the run elsewhere, or run what session.save(FOLDER) returns"
+            f"{saved}: holds another session; to fix: save the run elsewhere, or run what session.save(FOLDER) returns"
         )
-    return beside
+    return saved
 
 
 def _entry_point(group: str) -> Callable[..., Any] | None:

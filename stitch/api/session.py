@@ -27,14 +27,14 @@ from stitch.output.session_files import (
 )
 from stitch.output.urdf_file import to_urdf
 from stitch.screening.deep_check import refuse_whole
-from stitch.session.axis_poses import axis_tables, place_stated_axes, reported_poses
+from stitch.session.axis_poses import axis_tables, place_stated_axes, reported_poses, require_readings
 from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, seconds_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
 from stitch.session.reading.session_folder import checked_scan
 from stitch.session.reading.session_toml import read_axes, read_repeatability, read_robot, read_scanner, require_table
 from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
-from stitch.session.reading.views_table import require_agreement, require_covariate_name
+from stitch.session.reading.views_table import require_covariate_name, require_same_pose
 from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.session.thinning import MAX_POINTS
@@ -125,12 +125,13 @@ class Session(SessionData):
             <session>: the poses contradict what was measured: inverse: the poses are T_flange_base, ...
         """
         cell = cls.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
-        _require_kinds({"covariates": covariates}, Mapping | None)
-        _require_kinds({"clouds": clouds}, Mapping | Sequence | np.ndarray | None)
-        _require_kinds({"points": points}, Sequence | np.ndarray | None)
-        _require_kinds({"axes": axes}, Sequence)
-        _require_kinds({"check": check}, bool)
-        _require_kinds({f"axes, {k}": table for k, table in enumerate(axes)}, Mapping)
+        _require_kind("covariates", covariates, Mapping | None)
+        _require_kind("clouds", clouds, Mapping | Sequence | np.ndarray | None)
+        _require_kind("points", points, Sequence | np.ndarray | None)
+        _require_kind("axes", axes, Sequence)
+        _require_kind("check", check, bool)
+        for k, table in enumerate(axes):
+            _require_kind(f"axes, {k}", table, Mapping)
         with _errors_name_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
             has_poses = poses is not None or joints is not None or not axes
@@ -165,10 +166,12 @@ class Session(SessionData):
             >>> stitch.Session.empty(mount="eye_in_hand", name="bracket").views
             ()
         """
-        _require_kinds({"name": name, "unit": unit, "mount": mount}, str)
-        _require_kinds({"cloud_unit": cloud_unit}, str | None)
-        _require_kinds({"scanner": scanner}, Scanner | Mapping | None)
-        _require_kinds({"robot": robot}, Robot | Mapping | Path | str | None)
+        _require_kind("name", name, str)
+        _require_kind("unit", unit, str)
+        _require_kind("mount", mount, str)
+        _require_kind("cloud_unit", cloud_unit, str | None)
+        _require_kind("scanner", scanner, Scanner | Mapping | None)
+        _require_kind("robot", robot, Robot | Mapping | Path | str | None)
         path = Path(f"<{require_folder_name('name', name, 'name')}>")
         # Checked as a session.toml with the same entries is.
         toml = path / "session.toml"
@@ -258,20 +261,19 @@ def public_session(session: SessionData) -> Session:
     return Session(**{f.name: getattr(session, f.name) for f in fields(SessionData)})
 
 
-def _require_kinds(arguments: Mapping[str, Any], kinds: Any) -> None:
-    """Refuse a call with an argument of a wrong type.
+def _require_kind(argument: str, value: Any, kinds: Any) -> None:
+    """Refuse the value of an argument that is of a wrong type.
 
     Args:
-        arguments: values by name.
+        argument: its name, for the message.
         kinds: a type, or a union of types such as `str | None`.
 
     Raises:
-        InputError: names the first such argument, and the types that are allowed.
+        InputError: names the argument, and the types that are allowed.
     """
-    for name, value in arguments.items():
-        if not isinstance(value, kinds):
-            words = " or ".join(kind.__name__ for kind in get_args(kinds) or (kinds,)).replace("NoneType", "None")
-            raise InputError(f"{name}: is of type {type(value).__name__}; to fix: pass {words}")
+    if not isinstance(value, kinds):
+        words = " or ".join(kind.__name__ for kind in get_args(kinds) or (kinds,)).replace("NoneType", "None")
+        raise InputError(f"{argument}: is of type {type(value).__name__}; to fix: pass {words}")
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
@@ -333,7 +335,7 @@ def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Arra
         raise InputError(f"poses: {len(T)} for {count} views; to fix: pass one a view, in the same order")
     if from_joints is not None:
         for name, reported, computed in zip(names, T, from_joints, strict=True):
-            require_agreement(f"view {name}", reported, computed, METRES[cell.length_unit])
+            require_same_pose(f"view {name}", reported, computed, METRES[cell.length_unit])
     return T, q
 
 
@@ -346,14 +348,7 @@ def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session
         InputError: a view without a reading of an axis, or with two.
     """
     axes = read_axes(session.path / "session.toml", [dict(t) for t in tables], session.mount, session.has_poses)
-    for axis in axes:
-        columns = axis.columns(session.length_unit)
-        for view in session.views:
-            if len(set(columns) & set(view.covariates)) != 1:
-                raise InputError(
-                    f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with "
-                    f"{' or '.join(columns)}, one number a view"
-                )
+    require_readings(session.views, axes, session.length_unit)
     return public_session(place_stated_axes(session, axes)) if axes else session
 
 
@@ -472,8 +467,8 @@ def _errors_name_arguments(path: str) -> Iterator[None]:
         yield
     except StitchError as error:
         text = str(error)
-        for there, here in ((f"{path}/session.toml", path), (" in session.toml", ""), ("length_unit", "unit")):
-            text = text.replace(there, here)
+        for in_file, as_argument in ((f"{path}/session.toml", path), (" in session.toml", ""), ("length_unit", "unit")):
+            text = text.replace(in_file, as_argument)
         raise type(error)(text) from None
 
 
@@ -616,17 +611,19 @@ def _require_same(session: SessionData, folder: Path) -> None:
         InputError: the folder cannot be read, or names the view and what differs.
     """
     try:
-        read = session_folder.load_session(folder)
+        reread = session_folder.load_session(folder)
     except InputError as error:
         text = str(error).replace(str(folder), session.name)
         raise InputError(f"it would not be read back: {text}") from None
-    if read.names != session.names:
+    if reread.names != session.names:
         raise InputError(f"{session.name}: names of its views cannot be written; to fix: give them plain names")
-    held = {"pose": "T_base_flange", "joints": "joints", "time": "time_s", "covariates": "covariates"}
-    held["labelled points"] = "sighting"
-    for view, there in zip(session.views, read.views, strict=True):
-        lost = (what for what, name in held.items() if not same(getattr(view, name), getattr(there, name), _ROUNDED))
-        scans = [None if v.cloud is None else v.cloud.count for v in (view, there)]
-        odd = next(lost, None if scans[0] == scans[1] else "scan")
-        if odd is not None:
-            raise InputError(f"{session.name}: the {odd} of view {view.name} cannot be written; to fix: correct them")
+    fields_of_view = {"pose": "T_base_flange", "joints": "joints", "time": "time_s", "covariates": "covariates"}
+    fields_of_view["labelled points"] = "sighting"
+    for view, copy in zip(session.views, reread.views, strict=True):
+        lost = [what for what, f in fields_of_view.items() if not same(getattr(view, f), getattr(copy, f), _ROUNDED)]
+        counts = [None if v.cloud is None else v.cloud.count for v in (view, copy)]
+        lost += [] if counts[0] == counts[1] else ["scan"]
+        if lost:
+            raise InputError(
+                f"{session.name}: the {lost[0]} of view {view.name} cannot be written; to fix: correct them"
+            )

@@ -81,36 +81,37 @@ def suggest(
     """
     lines: list[str] = []
     given = set(state.model.effects)
-    left = at_most
+    remaining = at_most
     # The last run to which something was added; `state` is the one that is diagnosed.
     result: RunData | None = None
     while True:
-        diagnosis = None if known is not None and left else diagnose(state)
+        diagnosis = None if known is not None and remaining else diagnose(state)
         finding = known if diagnosis is None else _finding_of(diagnosis)
         assert finding is not None
         lines += finding.lines
-        if diagnosis is not None and (why := _reason_to_stop(diagnosis, left, at_most)) is not None:
-            fewer, happened = (None, []) if result is None else _drop_idle(result, given, recorder)
-            if fewer is None or not happened:
+        if diagnosis is not None and (why := _reason_to_stop(diagnosis, remaining, at_most)) is not None:
+            if result is None:
+                return None, [*lines, *why], diagnosis
+            result, drops = _drop_idle(result, given, recorder)
+            if not drops:
                 return result, [*lines, *why], diagnosis
             # Effects that turned out to be zero were dropped: the next diagnosis may name others in their place.
-            lines += happened
-            left += len(happened)
-            state = result = fewer
+            lines += drops
+            remaining += len(drops)
+            state = result
             continue
-        # It holds of the first state alone.
+        # What was known holds of the first state alone.
         known = None
-        before = result
-        result, happened = _add_found(state, finding, left, given, recorder)
-        lines += happened
-        added = set(result.effects) - set(state.effects)
+        fitted, attempts = _add_found(state, finding, remaining, given, recorder)
+        lines += attempts
+        added = set(fitted.effects) - set(state.effects)
         if not added:
-            return before, lines, replace(diagnosis or diagnose(state), tried=result.tried)
-        left -= min(len(added), left)
+            return result, lines, replace(diagnosis or diagnose(state), tried=fitted.tried)
+        remaining -= min(len(added), remaining)
         if set(state.effects) - given:
-            result, happened = _exchange_added(result, given, recorder)
-            lines += happened
-        state = result
+            fitted, exchanges = _exchange_added(fitted, given, recorder)
+            lines += exchanges
+        state = result = fitted
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
         del diagnosis
 
@@ -128,13 +129,13 @@ def _finding_of(diagnosis: Diagnosis) -> Finding:
     return Finding((*_finding_and_evidence(diagnosis), *notes), diagnosis.together, validations)
 
 
-def _reason_to_stop(diagnosis: Diagnosis, left: int, at_most: int) -> list[str] | None:
+def _reason_to_stop(diagnosis: Diagnosis, remaining: int, at_most: int) -> list[str] | None:
     """Return why nothing is added after a diagnosis, as lines; None where an effect is to be added.
 
     The lines are empty where the diagnosis names no single effect: its own sentences say so.
 
     Args:
-        left: number of effects that may still be added, of `at_most` at first.
+        remaining: number of effects that may still be added, of `at_most` at first.
     """
     if diagnosis.verdict != "missing_effect":
         return []
@@ -144,7 +145,7 @@ def _reason_to_stop(diagnosis: Diagnosis, left: int, at_most: int) -> list[str] 
     if diagnosis.dropped_before is not None:
         return [f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}."]
     effects = "1 effect" if at_most == 1 else f"{at_most} effects"
-    return None if left else [f"Stopped after {effects}; run it again to go on."]
+    return None if remaining else [f"Stopped after {effects}; run it again to go on."]
 
 
 def _add_found(
@@ -163,22 +164,24 @@ def _add_found(
 
     names = [name for name in finding.names if name not in state.tried][:at_most]
     while names:
-        tried, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
-        kept = [name for name in names if name in tried.effects]
-        # Mean square error on views left out, with the effects over without.
-        share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
+        fitted, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
+        kept = [name for name in names if name in fitted.effects]
         validation = finding.validations.get(names[0])
-        zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
-        reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
+        reason = None
+        if validation is not None and kept:
+            # Mean square error on views left out, with the effects over without.
+            share = (fitted.heldout_rms / state.heldout_or_fit_rms) ** 2
+            is_zero = max(t.sigmas_from_zero for t in fitted.terms if t.name in kept) < FAINT_SIGMAS
+            reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=is_zero)
         if kept and reason is None:
-            share_then = finding.validations[kept[0]].heldout if kept == [names[0]] and validation else float("nan")
             # The diagnosis predicted the error with its first effect alone, so nothing of several.
-            told = with_prediction(tried, state.heldout_or_fit_rms * share_then**0.5)
-            return told, [*lines, f"Added {' and '.join(kept)}. With it:"]
+            predicted_share = validation.heldout if validation is not None and kept == names[:1] else float("nan")
+            fitted = with_prediction(fitted, state.heldout_or_fit_rms * predicted_share**0.5)
+            return fitted, [*lines, f"Added {' and '.join(kept)}. With it:"]
         if len(names) == 1:
-            why = reason or tried.tried[names[0]]
-            dropped = replace(state, tried=state.tried | tried.tried | {names[0]: why})
-            return dropped, [f"{names[0]} was tried and dropped: {why}."]
+            why = reason or fitted.tried[names[0]]
+            unchanged = replace(state, tried=state.tried | fitted.tried | {names[0]: why})
+            return unchanged, [f"{names[0]} was tried and dropped: {why}."]
         # Together they do not earn their place: the one that is named is asked alone.
         names = names[:1]
     return state, []
@@ -261,20 +264,23 @@ def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> t
         fewer = {t.name: [name for name in result.effects if name != t.name] for t in added}
         faint = next((term.name for term in added if term.sigmas_from_zero < FAINT_SIGMAS), None)
         if faint is not None:
-            without = {faint: change(result, fewer[faint])}
-            reason = f"{faint} ends with no parameter that differs from zero"
+            idle, without = faint, change(result, fewer[faint])
+            reason = f"{idle} ends with no parameter that differs from zero"
         else:
-            without = {name: change(result, others) for name, others in fewer.items()}
-            faint = min(without, key=lambda name: without[name].heldout_or_fit_rms, default=None)
-            least = 1.0 if faint is None else without[faint].heldout_or_fit_rms / result.heldout_or_fit_rms
-            if faint is None or least * (HELDOUT_RISE if result.session.has_clouds else 1.0) >= 1.0:
+            fits = {name: change(result, others) for name, others in fewer.items()}
+            if not fits:
                 return result, lines
-            reason = f"without {faint} views left out are predicted better in the end"
+            idle = min(fits, key=lambda name: fits[name].heldout_or_fit_rms)
+            without = fits[idle]
+            ratio = without.heldout_or_fit_rms / result.heldout_or_fit_rms
+            if ratio * (HELDOUT_RISE if result.session.has_clouds else 1.0) >= 1.0:
+                return result, lines
+            reason = f"without {idle} views left out are predicted better in the end"
         lines.append(f"{reason}; it was dropped.")
         # Fitted once more, now shown.
         if recorder is not None:
-            without[faint] = change(result, fewer[faint], recorder)
-        result = replace(without[faint], tried=result.tried | {faint: reason})
+            without = change(result, fewer[idle], recorder)
+        result = replace(without, tried=result.tried | {idle: reason})
 
 
 def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:

@@ -26,8 +26,7 @@ _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Wr
 def add(
     run: _RunFolder,
     effects: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="EFFECT...", help="Effects to add.", autocompletion=complete_effect),
+        list[str] | None, typer.Argument(metavar="EFFECT...", help="Effects to add.", autocompletion=complete_effect)
     ] = None,
     suggested: Annotated[bool, typer.Option("--suggested", help="Diagnose and add until nothing is left.")] = False,
     group: Annotated[bool, typer.Option("--group", help="Diagnose; add effects that it cannot tell apart.")] = False,
@@ -107,9 +106,9 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
         with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
             memory = RunMemory()
             result = change(state, effects, memory)
-            result = with_prediction(result, _predicted(standing, state, effects))
-            if told := _as_good(standing, state, effects):
-                result = result.with_fit(notes=(told, *result.notes))
+            result = with_prediction(result, _predicted_heldout(standing, state, effects))
+            if note := _alternatives_note(standing, state, effects):
+                result = result.with_fit(notes=(note, *result.notes))
             memory.replay_run(recorder_for(scratch, recording, run), result)
             run_folder.write_with_page(result, scratch)
     _show_changed(result, run, as_json)
@@ -117,7 +116,7 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
         show_next(f"Next: stitch diagnose {shlex.quote(str(run))}")
 
 
-def _predicted(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> float:
+def _predicted_heldout(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> float:
     """Return the error on views left out (length_unit) that a diagnosis predicts with one more effect.
 
     NaN where several effects are added or some dropped, or where the diagnosis did not predict it.
@@ -133,7 +132,7 @@ def _predicted(standing: dict[str, Any], state: RunData, effects: Sequence[str])
     return known[0] if known and set(state.effects) < set(effects) else float("nan")
 
 
-def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> str:
+def _alternatives_note(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> str:
     """Return a sentence on the alternatives to the added effects that a diagnosis could not rule out; "" without any.
 
     Args:
@@ -165,7 +164,7 @@ def _add_diagnosed(
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output import run_folder
     from stitch.output.diagnosis_document import named_before
-    from stitch.output.plain_finding import plain_finding, suggested_command
+    from stitch.output.plain_finding import next_step_line, plain_finding
     from stitch.output.stored_run import standing_diagnosis
     from stitch.recorder import RunMemory
 
@@ -199,7 +198,7 @@ def _add_diagnosed(
     if not in_full():
         say(plain_finding(diagnosis, state.session.length_unit))
     if not as_json:
-        show_next(suggested_command(diagnosis, shlex.quote(str(run))))
+        show_next(next_step_line(diagnosis, shlex.quote(str(run))))
 
 
 def _show_nothing_missing(standing: dict[str, Any], run: Path, as_json: bool) -> None:
@@ -254,16 +253,16 @@ def remarks(result: RunData) -> list[str]:
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 
     lines: list[str] = []
-    earned: list[str] = []
+    helpful: list[str] = []
     if len(result.ledger) > 1:
         before, after = result.ledger[-2:]
-        grown = sorted(set(after.effects) - set(before.effects))
+        added = sorted(set(after.effects) - set(before.effects))
         if after.heldout_rms < HELDOUT_FALL * before.heldout_rms:
-            earned = grown
-        elif grown:
-            clear = max(term.sigmas_from_zero for term in result.terms if term.name in grown)
+            helpful = added
+        elif added:
+            clear = max(term.sigmas_from_zero for term in result.terms if term.name in added)
             rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
-            lines.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
+            lines.append(_unseen_in_residuals(", ".join(added), clear, "rose" if rose else "did not fall"))
     for term in (term for term in result.terms if not term.is_geometry):
         wild = [p.name for p in term.parameters if p.fitted and not p.held and p.beyond_belief(p.value, p.sigma)]
         if wild:
@@ -272,7 +271,7 @@ def remarks(result: RunData) -> list[str]:
             lines.append(
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "
                 "zero by two sigmas."
-                if term.name in earned
+                if term.name in helpful
                 else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
             )
     return lines

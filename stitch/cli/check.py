@@ -81,7 +81,10 @@ def _check_deeply(sessions: list[Path], as_json: bool) -> None:
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         for path, names, problems, unread in checked:
-            for line in [p.line(names) for p in problems] or ["nothing wrong was found"] * (not unread):
+            lines = [p.line(names) for p in problems]
+            if not lines and not unread:
+                lines = ["nothing wrong was found"]
+            for line in lines:
                 say(f"{path}: {line}", hang=2)
     for *_, unread in checked:
         if unread:

@@ -25,8 +25,7 @@ _WORST_ROWS = 5
 _LISTED_TABLES = 4
 _WITNESSES = ("open3d",)
 _With = Annotated[
-    str | None,
-    typer.Option("--with", metavar="PROGRAM", help="Another program registers the same scans: open3d."),
+    str | None, typer.Option("--with", metavar="PROGRAM", help="Another program registers the same scans: open3d.")
 ]
 
 
@@ -155,10 +154,10 @@ def _show_followed(followed: Sequence[Dependence], to_um: float) -> None:
     say(_SCOPE)
     if not first.clear:
         return
-    beside = also_clear(followed)
-    if beside:
-        say(f"Beside that they follow {', '.join(f'{x.covariate} (p = {x.p_beside:.1g})' for x in beside)}.")
-    if idle := [x.covariate for x in followed if x.clear and x not in (*equal, *beside)]:
+    further = also_clear(followed)
+    if further:
+        say(f"Beside that they follow {', '.join(f'{x.covariate} (p = {x.p_beside:.1g})' for x in further)}.")
+    if idle := [x.covariate for x in followed if x.clear and x not in (*equal, *further)]:
         say(f"Alike, but not needed beside it: {', '.join(idle)}.")
     axis = ", ".join(f"{x:+.2f}" for x in first.direction)
     unit = f" ({first.unit})" if first.unit else ""

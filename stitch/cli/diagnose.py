@@ -26,12 +26,7 @@ _CLEAR = 0.05
 _MIN_POSTERIOR_SHARE = 0.05
 
 
-def diagnose_run(
-    run: RunFolder,
-    effects_file: EffectsFile = None,
-    trust: Trust = False,
-    as_json: Json = False,
-) -> None:
+def diagnose_run(run: RunFolder, effects_file: EffectsFile = None, trust: Trust = False, as_json: Json = False) -> None:
     """Say which physical effect is missing in the model of a run, or why nobody can tell.
 
     Of the folder of several sessions of one arm: what they decide together.
@@ -42,7 +37,7 @@ def diagnose_run(
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
     from stitch.output.json_file import runs_of_rig, to_json
-    from stitch.output.plain_finding import suggested_command
+    from stitch.output.plain_finding import next_step_line
 
     if sessions := runs_of_rig(run):
         _diagnose_together([run / name for name in sessions], effects_file, trust, as_json)
@@ -53,7 +48,7 @@ def diagnose_run(
         emit(to_json(document))
     else:
         show_diagnosis(diagnosis)
-        show_next(suggested_command(diagnosis, shlex.quote(str(run))))
+        show_next(next_step_line(diagnosis, shlex.quote(str(run))))
     end_at_once()
 
 

@@ -135,7 +135,7 @@ def show_next_views(diagnosis: Diagnosis, document: dict[str, Any]) -> None:
             what = f"To separate {' from '.join(proposal.separates)}" if proposal.separates[1:] else "To see more of it"
             say(f"{what}: {proposal.do}.")
     if not diagnosis.next:
-        say(_why_nothing(diagnosis))
+        say(_why_nothing_proposed(diagnosis))
 
 
 def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[str, Any]) -> None:
@@ -160,23 +160,23 @@ def _show_deciding(diagnosis: Diagnosis, poses: list[Proposal], document: dict[s
     deciding = (document.get("screen") or {}).get("deciding_view")
     if deciding is None:
         return
-    is_angle, unit = deciding["value_unit"] == "rad", deciding["value_unit"]
 
-    def told(value: float) -> str:
-        return angle_text(value) if is_angle else length_text(value, unit)
+    def in_words(value: float) -> str:
+        unit = deciding["value_unit"]
+        return angle_text(value) if unit == "rad" else length_text(value, unit)
 
     expects = "; ".join(
-        f"{row['effect']} {told(row['value'])} ± {told(2 * row['sigma'])}" for row in deciding["expected"]
+        f"{row['effect']} {in_words(row['value'])} ± {in_words(2 * row['sigma'])}" for row in deciding["expected"]
     )
     say(f"In the first, {deciding['of']} would be off by: {expects} (95 %).")
 
 
-def _why_nothing(diagnosis: Diagnosis) -> str:
+def _why_nothing_proposed(diagnosis: Diagnosis) -> str:
     """Return a sentence, by the verdict, on why nothing is proposed."""
     from stitch.diagnosis.thresholds import ALIAS_CORRELATION
 
     effects = diagnosis.effects
-    apart = "No effect correlates with {} by more than " + f"{ALIAS_CORRELATION} in these views"
+    no_alias = "No effect correlates with {} by more than " + f"{ALIAS_CORRELATION} in these views"
     if diagnosis.verdict == "adequate":
         return "No missing effect was found: there is nothing to tell apart."
     if diagnosis.verdict == "unknown_effect":
@@ -184,5 +184,5 @@ def _why_nothing(diagnosis: Diagnosis) -> str:
     if len(effects) > 1:
         return f"No pose within reach, and no artefact that is known here, separates {' from '.join(effects)}."
     if diagnosis.verdict == "missing_effect" and not diagnosis.likelier_than_not:
-        return f"{apart.format(effects[0])}. More views, at any poses, can tell it from chance."
-    return f"Nothing has to be told apart. {apart.format('the likeliest')}."
+        return f"{no_alias.format(effects[0])}. More views, at any poses, can tell it from chance."
+    return f"Nothing has to be told apart. {no_alias.format('the likeliest')}."

@@ -15,8 +15,7 @@ EffectsFile = Annotated[
 Trust = Annotated[bool, typer.Option("--trust", help="Run the Python file of effects that the model names.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace the run of another session.")]
 Tolerance = Annotated[
-    float | None,
-    typer.Option("--tolerance", help="Within which the views have to agree on the part, length_unit."),
+    float | None, typer.Option("--tolerance", help="Within which the views have to agree on the part, length_unit.")
 ]
 Memory = Annotated[
     str | None, typer.Option("--memory", metavar="SIZE", help="Stay below so much, such as 2GB; default: no limit.")

@@ -133,12 +133,14 @@ def _write_run_page(
         with show_activity(activity):
             run_folder.call_entry_points("stitch.reports", state, page, tolerance, required=True)
         show_light(state, tolerance)
+        if not with_diagnosis:
+            return page
         # A diagnosis of this very model stays on the page.
-        shows = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
-        stands = shows and stored_run.standing_diagnosis(run, state)
-        if with_diagnosis and not (stands and (run / "compare.json").is_file()):
+        shows_diagnosis = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
+        is_current = shows_diagnosis and bool(stored_run.standing_diagnosis(run, state))
+        if not is_current or not (run / "compare.json").is_file():
             write_comparison(state, run)
-        if with_diagnosis and not stands:
+        if not is_current:
             with show_activity("diagnosing: trying every effect"):
                 diagnosis = pipeline.diagnose(state)
             write_diagnosis(diagnosis, state, run)

@@ -152,8 +152,8 @@ def run(
         method = register or DEFAULT
         runs = run_rig(loaded, model, recorders, named, keep, kept, register=method, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
-        with ThreadPoolExecutor(1) as beside:
-            written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
+        with ThreadPoolExecutor(1) as writer:
+            written = writer.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
             if not as_json:
                 _show_runs(runs, tolerance)
             mesh_fits = written.result()
@@ -215,8 +215,8 @@ def _follow_session(folder: Path, views: int | None) -> None:
     table = folder / "views.csv"
     read_session_document(folder / "session.toml")
     end = "Ctrl-C ends it and runs the session" if views is None else f"the session is run once {views} views are there"
-    begun = f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}."
-    say(begun, stream=sys.stderr)
+    line = f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}."
+    say(line, stream=sys.stderr)
     live: LiveSession | None = None
     failed = _Failures()
     try:

@@ -7,7 +7,7 @@ import os
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout, suppress
 from functools import wraps
 from pathlib import Path
 from typing import IO, Any, TextIO, TypeVar
@@ -34,13 +34,11 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
     terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
 
 
-@contextmanager
-def answers() -> Iterator[None]:
+def answers() -> AbstractContextManager[None]:
     """Send lines and tables for people to standard output while the block lasts, as the result of a command."""
     from stitch.system.process import answers_to
 
-    with answers_to(results_stream):
-        yield
+    return answers_to(results_stream)
 
 
 def show_block(rows: Sequence[tuple[str, str]]) -> None:
@@ -56,10 +54,7 @@ def show_block(rows: Sequence[tuple[str, str]]) -> None:
 
 
 def show_table(
-    title: str,
-    headings: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    words: Sequence[str] | None = None,
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[str] | None = None
 ) -> None:
     """Print a table with aligned columns.
 
@@ -112,14 +107,11 @@ def show_files(folder: Path, names: Sequence[str]) -> None:
             say(f"  {folder / name}")
 
 
-@contextmanager
-def headlines_only() -> Iterator[None]:
+def headlines_only() -> AbstractContextManager[None]:
     """Let commands print only headlines and main numbers while the block lasts: their caller prints the rest."""
-    _briefly.append(True)
-    try:
-        yield
-    finally:
-        _briefly.pop()
+    from stitch.system.process import held_last
+
+    return held_last(_briefly, True)
 
 
 def in_full() -> bool:
@@ -137,11 +129,11 @@ def stdout_for_results(command: Command) -> Command:
     """Return a command that prints only what it `emit`s on standard output; all else goes to standard error."""
 
     @wraps(command)
-    def apart(*arguments: Any, **options: Any) -> Any:
+    def redirected(*arguments: Any, **options: Any) -> Any:
         with _stdout_redirected():
             return command(*arguments, **options)
 
-    return apart  # type: ignore[return-value]
+    return redirected  # type: ignore[return-value]
 
 
 def results_stream() -> IO[str]:
@@ -160,13 +152,10 @@ def _stdout_redirected() -> Iterator[None]:
 
     Python prints to sys.stdout, compiled libraries to file descriptor 1: both are redirected.
     """
-    out = sys.stdout
-    with _own_descriptor(out) as stream, redirect_stdout(sys.stderr):
-        _results.append(stream)
-        try:
-            yield
-        finally:
-            _results.pop()
+    from stitch.system.process import held_last
+
+    with _own_descriptor(sys.stdout) as stream, redirect_stdout(sys.stderr), held_last(_results, stream):
+        yield
 
 
 @contextmanager

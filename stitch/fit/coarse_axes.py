@@ -18,7 +18,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.axes import Axes, Axis, AxisMotion
 from stitch.session.axis_poses import axes_of, place_axes, reported_poses
-from stitch.session.capture import Capture, build_capture, of_scanners, part_size
+from stitch.session.capture import Capture, build_capture, part_size, with_scanners
 from stitch.session.measurement import Measurement, measurement_of
 from stitch.session.session import SessionData
 
@@ -63,7 +63,7 @@ def _placed(session: SessionData, measurement: Measurement) -> Measurement:
     capture = measurement.capture
     T = np.array([view.T_base_flange for view in session.views])
     placed = build_capture(capture.name, capture.scans, T, session.mount, capture.sightings)
-    return measurement_of(session, of_scanners(session, placed))
+    return measurement_of(session, with_scanners(session, placed))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from stitch.diagnosis.sentences import law_in_words
 from stitch.diagnosis.systematic_laws import law_of, law_size
 from stitch.diagnosis.validation import CrossValidation
 from stitch.output.finding_screen import clearest_parameter, finding_screen
-from stitch.output.plain_finding import command_without_a_view, plain_finding, suggested_command
+from stitch.output.plain_finding import next_step_line, next_step_without_a_view, plain_finding
 from stitch.output.result_document import parameter_row
 from stitch.output.schema import NUMBER, NUMBER_OR_NULL, TEXT, Document, Key, Kind, list_of, rows_of
 
@@ -186,8 +186,8 @@ DIAGNOSIS = Document(
     Key("joint_laws", rows_of("joint covariate share at error sigma may_follow"), "curves"),
     Key("time_law", _TIME_LAW.or_null(), "time_curve"),
     Key("next", rows_of("do separates joints_deg views T_base_flange wait_s probability")),
-    Key("next_command", write=lambda d: suggested_command(d, "RUN")),
-    Key("command_without_a_view", write=lambda d: command_without_a_view(d, "RUN")),
+    Key("next_command", write=lambda d: next_step_line(d, "RUN")),
+    Key("command_without_a_view", write=lambda d: next_step_without_a_view(d, "RUN")),
     Key(
         "alias_matrix",
         write=lambda d: {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},

@@ -6,6 +6,7 @@ The page of a run, its review and the first tab of its recording draw from this 
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from stitch.numerics.least_squares import project_out
 from stitch.numerics.units import angle_text, display_unit, length_text
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches
 from stitch.output.comparison.model_history import model_history
-from stitch.output.plain_finding import open_doubts
+from stitch.output.plain_finding import errs_by_view, open_doubts
 from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, effect_description, plain_covariate
 from stitch.system.threads import remembered
 
@@ -49,7 +50,7 @@ _MOSTLY = 0.9
 _CLEAR, _MOST_LINKS = 5.0, 2
 # A chance that needs no number.
 _PLAIN_CHANCE = 0.5
-_NAMING = ("missing_effect", "cannot_tell")
+_VERDICTS_WITH_NAMES = ("missing_effect", "cannot_tell")
 # A source of less of the error than this share of its square has no place in a strip.
 _SEEN_SHARE = 1e-4
 
@@ -60,7 +61,7 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
     candidates = compared(diagnosis)
     patches, present, if_added = _fields(diagnosis, candidates)
     trends = trends_of_candidates(diagnosis.linear, [c.ranked.score for c in candidates])
-    why = _why(diagnosis, trends)
+    why = _trend_behind_finding(diagnosis, trends)
     return {
         "headline": _headline(diagnosis, trends),
         "proof": _proof(diagnosis, candidates, trends, present, if_added),
@@ -106,29 +107,25 @@ def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
     The best are those that leave the smallest share of the mean square error on views left out.
     """
     named = diagnosis.effects
-
-    def heldout(candidate: CandidateEffect) -> float:
-        return candidate.cross_validation.heldout if candidate.cross_validation else 0.0
-
-    helping = [
-        c
-        for c in diagnosis.candidates
-        if c.ranked.score.observable
-        and c.ranked.score.fitted
-        and (c.name in named or (c.cross_validation and heldout(c) < _HELPS))
-    ]
-    helping.sort(key=lambda c: (named.index(c.name) if c.name in named else len(named), heldout(c)))
-    return helping[:_BEST]
+    ranks = {name: i for i, name in enumerate(named)}
+    ordered = list[tuple[int, float, CandidateEffect]]()  # by place among the named effects, then by the share
+    for candidate in diagnosis.candidates:
+        score, validation = candidate.ranked.score, candidate.cross_validation
+        share = validation.heldout if validation else 0.0
+        if score.observable and score.fitted and (candidate.name in ranks or (validation and share < _HELPS)):
+            ordered.append((ranks.get(candidate.name, len(named)), share, candidate))
+    ordered.sort(key=itemgetter(0, 1))
+    return [candidate for *_, candidate in ordered[:_BEST]]
 
 
-def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | None:
+def _trend_behind_finding(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | None:
     """Return the trend that is drawn as the reason for a finding; None where there is none.
 
     It is that of the effect which is missing; where nothing is, that of the model's last effect. For an unknown effect
     it is the law, the joint's curve or the covariate that the error follows most clearly.
     """
     linear = diagnosis.linear
-    if diagnosis.verdict in _NAMING:
+    if diagnosis.verdict in _VERDICTS_WITH_NAMES:
         return trends.get(diagnosis.effects[0])
     if diagnosis.verdict == "adequate":
         return trend_in_model(linear, linear.model.terms[-1]) if linear.model.effects else None
@@ -179,8 +176,8 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
     if named.cross_validation is not None and validation is not None:
         more = left - diagnosis.rms_if_added(named.cross_validation)[1]
         if more > _WORSE * left:
-            told, least = (length_text(value, unit, 2) for value in (left, left - more))
-            return f"{'yes, though' if is_named else 'no:'} it leaves {told} instead of {least}"
+            its, least = (length_text(value, unit, 2) for value in (left, left - more))
+            return f"{'yes, though' if is_named else 'no:'} it leaves {its} instead of {least}"
     if is_named:
         rarer = candidate.ranked.log_belief < named.ranked.log_belief
         return "yes, though met more rarely (a judgement)" if rarer else "yes"
@@ -233,7 +230,7 @@ def _formula(diagnosis: Diagnosis) -> str:
 
     Undecided effects get a sentence each; where nothing is missing, it is that of the model's last effect.
     """
-    if diagnosis.verdict in _NAMING:
+    if diagnosis.verdict in _VERDICTS_WITH_NAMES:
         laws = [f"{r.score.candidate.effect.formula}; {fitted_amounts(r)}" for r in diagnosis.named]
         if diagnosis.verdict == "missing_effect":
             return f"The law: {laws[0]}."
@@ -266,14 +263,15 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
     match diagnosis.verdict:
         case "adequate":
             in_model = [effect_description(name) or name for name in diagnosis.linear.model.effects]
-            tested = _tested(diagnosis, "further " if in_model else "missing ")
-            added = f"In the model: {'; '.join(in_model)}. " if in_model else ""
-            return f"{added}{tested}"
+            if not in_model:
+                return _tested(diagnosis, "missing")
+            return f"In the model: {'; '.join(in_model)}. {_tested(diagnosis, 'further')}"
         case "unknown_effect":
             follows = ""
-            if diagnosis.follows_field:
-                by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
-                follows = ": each scan errs by itself" if by_view else ": the scanner errs over its field of view"
+            if errs_by_view(diagnosis):
+                follows = ": each scan errs by itself"
+            elif diagnosis.follows_field:
+                follows = ": the scanner errs over its field of view"
             elif diagnosis.laws:
                 follows = f": {' or '.join(unnamed_in_words(diagnosis))}"
             elif diagnosis.curves:
@@ -291,12 +289,12 @@ def _tested(diagnosis: Diagnosis, which: str) -> str:
     """Return the sentence that none of the tested effects was found, and how many could not be tested.
 
     Args:
-        which: "missing " or "further ", the adjective before "effect".
+        which: "missing" or "further", the adjective before "effect".
     """
     tried = effects_tried(diagnosis)
     untested = len(diagnosis.candidates) - tried + len(diagnosis.missing)
     others = f"; {untested} could not be tested" if untested else ""
-    return f"No {which}effect was found among {tried}{others}."
+    return f"No {which} effect was found among {tried}{others}."
 
 
 def effects_tried(diagnosis: Diagnosis) -> int:
@@ -314,8 +312,9 @@ def untested_text(diagnosis: Diagnosis) -> str:
     for needs in dict.fromkeys(diagnosis.missing.values()):
         names = [name for name, lacks in diagnosis.missing.items() if lacks == needs]
         were, they = ("was", "it needs") if len(names) == 1 else ("were", "they need")
-        told = " and ".join(map(describe_need, needs))
-        lines.append(f"{' and '.join(names).capitalize()} {were} not tested: {they} {told}.")
+        lines.append(
+            f"{' and '.join(names).capitalize()} {were} not tested: {they} {' and '.join(map(describe_need, needs))}."
+        )
     return " ".join(lines)
 
 
@@ -339,8 +338,8 @@ def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     misfit = min(diagnosis.overlap_misfit**2, total - explained - scanner)
     left = max(total - explained - scanner - misfit, 0.0)
     # These sources are counted above already, or are corrected by the model.
-    beside = {*diagnosis.effects, *diagnosis.linear.model.effects, "sensor noise", "scanner field"}
-    shares = [(line.source, line.variance_share) for line in diagnosis.budget if line.source not in beside]
+    counted = {*diagnosis.effects, *diagnosis.linear.model.effects, "sensor noise", "scanner field"}
+    shares = [(line.source, line.variance_share) for line in diagnosis.budget if line.source not in counted]
     whole = sum(share for _, share in shares)
     scatter = sum(share for source, share in shares if source in NOT_REPEATING) / whole if whole > 0 else 1.0
     sources += [("arm", "arm's scatter", left * scatter), ("scanner", "scanner's noise", scanner)]
@@ -362,20 +361,20 @@ def unseen_text(diagnosis: Diagnosis) -> str:
         return ""
     linear, unit = diagnosis.linear, diagnosis.linear.measurement.length_unit
     hand_eye = linear.reduce(linear.design[:, :6])
-    told = []
+    sizes = list[tuple[float, str]]()  # by how much it moves the views, and its text
     for candidate in diagnosis.candidates:
-        name, every = clearest_parameter(candidate), candidate.ranked.score.candidate.forms[0]
-        k = next((k for k, p in enumerate(every.term.parameters) if p.name == name), 0)
+        name, form = clearest_parameter(candidate), candidate.ranked.score.candidate.forms[0]
+        k = next((k for k, p in enumerate(form.term.parameters) if p.name == name), 0)
         size = candidate.detectable.get(name or "", np.inf)
         if not np.isfinite(size):
             continue
         # Displacement of the views per unit of the parameter, without the part that the hand-eye can imitate.
-        column = project_out(hand_eye, every.reduced[:, k : k + 1])
+        column = project_out(hand_eye, form.reduced[:, k : k + 1])
         moved = size * float(np.linalg.norm(column)) / np.sqrt(max(linear.mixed.size, 1))
-        factor, shown = display_unit(every.term.parameters[k].unit)
+        factor, shown = display_unit(form.term.parameters[k].unit)
         amount = f"{name} = {factor * size:.2g} {shown}".rstrip()
-        told.append((moved, f"{candidate.name} below {amount} (moves views by {length_text(moved, unit, 2)})"))
-    largest = [text for _, text in sorted(told, reverse=True)[:_BEST]]
+        sizes.append((moved, f"{candidate.name} below {amount} (moves views by {length_text(moved, unit, 2)})"))
+    largest = [text for _, text in sorted(sizes, reverse=True)[:_BEST]]
     return f"Too small to show here: {'; '.join(largest)}." if largest else ""
 
 
@@ -465,7 +464,7 @@ def _proof(
     now = length_text(diagnosis.heldout_rms, unit, 2)
     noise = length_text(diagnosis.noise_floor, unit, 2)
     error = f"The error on held-out views is {now}; the scanner's noise alone would leave {noise}."
-    if diagnosis.verdict not in _NAMING:
+    if diagnosis.verdict not in _VERDICTS_WITH_NAMES:
         return error
     named = [c for c in candidates if c.name in diagnosis.effects]
     is_one = diagnosis.verdict == "missing_effect"
@@ -504,17 +503,17 @@ def _size(why: EffectTrend, unit: str) -> str:
         unit: length unit.
     """
 
-    def told(value: float) -> str:
+    def in_words(value: float) -> str:
         return angle_text(value, 2) if why.value_unit == "rad" else length_text(value, unit, 2)
 
     largest, drawn = (float(np.abs(values).max()) for values in (why.effect, why.predicted))
-    size = told(largest)
+    size = in_words(largest)
     # An event such as a slip displaces some views alike: these are counted.
     away = int(np.sum(np.abs(why.effect) > largest / 2))
     if why.follows == "view order" and away <= len(why.views) / 2:
         return f"{away} of {len(why.views)} views sit {size} away from the others."
     # What the plot shows is what the hand-eye leaves.
-    taken = f", of which the hand-eye takes all but {told(drawn)}" if drawn < _MOSTLY * largest else ""
+    taken = f", of which the hand-eye takes all but {in_words(drawn)}" if drawn < _MOSTLY * largest else ""
     follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
     if np.ptp(why.effect) < _FLAT * largest:

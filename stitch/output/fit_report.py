@@ -64,8 +64,8 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         own = hand_eye_lines(scanner.T_mount, scanner.covariance, run.session.mount, unit, unknown=scanner.unknown)
         lines = [*(lines if scanner is not run.scanners[0] else []), f"Scanner {scanner.name}: {own[0]}", *own[1:]]
         if scanner.alone is not None:
-            U, alone, apart = (length_text(x, unit, 2) for x in (scanner.U, scanner.U_alone, scanner.apart))
-            lines.append(f"  U at the part {U}; by its own views alone {alone}, and {apart} from here")
+            U, U_alone, distance = (length_text(x, unit, 2) for x in (scanner.U, scanner.U_alone, scanner.apart))
+            lines.append(f"  U at the part {U}; by its own views alone {U_alone}, and {distance} from here")
     sigma = run.fit.sigma_anywhere
     if sigma is not None and not run.unknown:
         turn, shift = (COVERAGE_FACTOR * float(np.linalg.norm(part)) for part in (sigma[:3], sigma[3:]))

@@ -125,9 +125,9 @@ def _rim(triangles: Indices) -> Indices:
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     count = int(triangles.max(initial=0)) + 1
     # An edge (a, b) as one number, a·count + b.
-    there = edges @ [count, 1]
-    back = edges[:, ::-1] @ [count, 1]
-    return edges[~np.isin(there, back)]
+    forward = edges @ [count, 1]
+    reverse = edges[:, ::-1] @ [count, 1]
+    return edges[~np.isin(forward, reverse)]
 
 
 def _without_pinches(triangles: Indices) -> Indices:

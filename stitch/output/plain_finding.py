@@ -40,11 +40,11 @@ def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
 
 def open_doubts(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return the doubts about the session, without one that the effect named by the diagnosis would explain."""
-    return tuple(doubt for doubt in diagnosis.doubts if doubt != _same_as_finding(diagnosis))
+    return tuple(doubt for doubt in diagnosis.doubts if doubt != _doubt_with_same_cure(diagnosis))
 
 
-def _same_as_finding(diagnosis: Diagnosis) -> str | None:
-    """Return the doubt about the session whose cure is to fit the effect that is missing; None where none is.
+def _doubt_with_same_cure(diagnosis: Diagnosis) -> str | None:
+    """Return the doubt about the session whose text proposes to fit the effect that is missing; None where none does.
 
     None also where several doubts propose that effect: then it cannot be told which of them it explains.
     """
@@ -73,7 +73,7 @@ def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
     validation = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0]).cross_validation
     though = "" if diagnosis.likelier_than_not else ", though chance is more likely"
     missing = "Missing in the model" if diagnosis.certain else f"Perhaps missing in the model{though}"
-    if (doubt := _same_as_finding(diagnosis)) is not None:
+    if (doubt := _doubt_with_same_cure(diagnosis)) is not None:
         headline = doubt_headline(doubt).removesuffix(".")
         named = f"{diagnosis.effects[0]} ({headline[0].lower()}{headline[1:]})"
     if diagnosis.dropped_before is not None:
@@ -125,7 +125,7 @@ def _error_location(diagnosis: Diagnosis) -> str:
 
     The most specific statement comes first: scanner, law, joint, time, shape of the part, then single covariates.
     """
-    if diagnosis.follows_field and diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view:
+    if errs_by_view(diagnosis):
         return ": each scan has its own error, as if the part bent or the scanner changed"
     if diagnosis.follows_field:
         return ": the scanner's error depends on the position in its field of view"
@@ -138,13 +138,22 @@ def _error_location(diagnosis: Diagnosis) -> str:
         return ": the pose errors change over time, but follow no known formula"
     if diagnosis.overlap_misfit:
         return ": the scanner or the part's shape is wrong, not only the poses"
-    clear = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
-    follows = [*dict.fromkeys(clear)]
-    if follows:
+    if follows := _clear_covariates(diagnosis):
         where = f", at {' or '.join(diagnosis.places)}" if diagnosis.places else ""
         return f": the remaining error follows {' and '.join(follows[:2])}{where}"
     # The likeliest name, and why it does not hold.
     return f": {diagnosis.notes[0]}" if diagnosis.notes else ""
+
+
+def errs_by_view(diagnosis: Diagnosis) -> bool:
+    """Return whether the scanner's error explains the finding and is another one in each scan."""
+    return diagnosis.follows_field and diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
+
+
+def _clear_covariates(diagnosis: Diagnosis) -> list[str]:
+    """Return in words, each once, the covariates that the error follows clearly."""
+    clear = (x.covariate for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE)
+    return [*dict.fromkeys(map(plain_covariate, clear))]
 
 
 def remedy_at_machine(diagnosis: Diagnosis) -> str:
@@ -153,36 +162,41 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
     Empty where the effect is not certain, or where there is no place to look.
     """
     remedy, when = "", ""
-    if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
-        by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
-        remedy = "" if by_view else "have the scanner calibrated"
-    elif diagnosis.verdict == "unknown_effect" and diagnosis.laws:
-        law = law_of(diagnosis.laws[0])
-        remedy = f"look for what changes with {plain_covariate(law.driver.covariate)} at {law.place.name}"
-        if law.driver.covariate == f"j{law.place.joint}_deg":
-            remedy = f"have joint {law.place.joint} checked: gear, bearing, and what hangs on it"
-    elif diagnosis.verdict == "unknown_effect" and diagnosis.curves:
-        curve = diagnosis.curves[0]
-        beside = ", and what the base stands on" if "base" in curve.place else ""
-        remedy = f"have joint {curve.joint} checked: gear, bearing, and what hangs on it{beside}"
-    elif diagnosis.verdict == "unknown_effect":
-        follows = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
-        remedy = f"look for what changes with {follows[0]}" if follows else ""
-    elif diagnosis.verdict == "missing_effect" and diagnosis.certain:
-        remedy, when = REMEDIES.get(diagnosis.effects[0], ""), _AFTER_ADDING
-    elif diagnosis.verdict == "cannot_tell" and diagnosis.certain and not unnamed_in_words(diagnosis):
-        remedies = {REMEDIES.get(effect, "") for effect in diagnosis.effects}
-        remedy = remedies.pop() if len(remedies) == 1 else "change nothing until it is known which"
-    elif diagnosis.verdict == "adequate":
-        added = dict.fromkeys(REMEDIES.get(effect, "") for effect in diagnosis.linear.model.effects)
-        remedy = "; ".join(filter(None, added))
-        if not remedy:
-            return "Nothing to do at the machine."
+    match diagnosis.verdict:
+        case "unknown_effect":
+            remedy = _where_to_look(diagnosis)
+        case "missing_effect" if diagnosis.certain:
+            remedy, when = REMEDIES.get(diagnosis.effects[0], ""), _AFTER_ADDING
+        case "cannot_tell" if diagnosis.certain and not unnamed_in_words(diagnosis):
+            remedies = {REMEDIES.get(effect, "") for effect in diagnosis.effects}
+            remedy = remedies.pop() if len(remedies) == 1 else "change nothing until it is known which"
+        case "adequate":
+            added = dict.fromkeys(REMEDIES.get(effect, "") for effect in diagnosis.linear.model.effects)
+            remedy = "; ".join(filter(None, added))
+            if not remedy:
+                return "Nothing to do at the machine."
     return f"At the machine{when}: {remedy}." if remedy else ""
 
 
-def suggested_command(diagnosis: Diagnosis, run: str) -> str:
-    """Return the command to type next, with what it is for.
+def _where_to_look(diagnosis: Diagnosis) -> str:
+    """Return what to check where no known effect explains the error, by what it follows; "" where that is unknown."""
+    if diagnosis.follows_field:
+        return "" if errs_by_view(diagnosis) else "have the scanner calibrated"
+    if diagnosis.laws:
+        law = law_of(diagnosis.laws[0])
+        if law.driver.covariate == f"j{law.place.joint}_deg":
+            return f"have joint {law.place.joint} checked: gear, bearing, and what hangs on it"
+        return f"look for what changes with {plain_covariate(law.driver.covariate)} at {law.place.name}"
+    if diagnosis.curves:
+        curve = diagnosis.curves[0]
+        base = ", and what the base stands on" if "base" in curve.place else ""
+        return f"have joint {curve.joint} checked: gear, bearing, and what hangs on it{base}"
+    follows = _clear_covariates(diagnosis)
+    return f"look for what changes with {follows[0]}" if follows else ""
+
+
+def next_step_line(diagnosis: Diagnosis, run: str) -> str:
+    """Return the line that says what to do next, and ends in the command to type: "Next…: stitch …".
 
     Args:
         run: path of the run as it has to be typed in a shell.
@@ -191,11 +205,11 @@ def suggested_command(diagnosis: Diagnosis, run: str) -> str:
         return f"Next: fix the problem above; for details: stitch review {run}"
     if any(proposal.probability is not None for proposal in diagnosis.next):
         return f"Next, for the view that decides best: stitch next {run} -o next.src"
-    return command_without_a_view(diagnosis, run)
+    return next_step_without_a_view(diagnosis, run)
 
 
-def command_without_a_view(diagnosis: Diagnosis, run: str) -> str:
-    """Return the command to type next if no further view is taken, with what it is for.
+def next_step_without_a_view(diagnosis: Diagnosis, run: str) -> str:
+    """Return the same line for a reader who takes no view now; where only views help, the command that plans them.
 
     Args:
         run: path of the run as it has to be typed in a shell.

@@ -97,7 +97,7 @@ def model_of(run: RunData) -> ModelFile:
         T_mount_coarse=run.T_mount_coarse,
         covariance=run.mount_covariance,
         effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
-        effects_file=_effects_file(run),
+        effects_file=recorded_effects_file(run),
         targets=_targets(run.targets),
         effects_covariance=run.model.effects_covariance,
         axes={a.name: (a.direction, a.point) for a in run.session.axes if a.direction is not None},
@@ -105,14 +105,17 @@ def model_of(run: RunData) -> ModelFile:
     )
 
 
-def _effects_file(run: RunData) -> str | None:
-    """Return the Python file of the user's effects in the model; None without any.
+def recorded_effects_file(run: RunData) -> str | None:
+    """Return the path of the user's effects that model.toml names, their one Python file or else `FILE`; None without.
 
-    It is `FILE`, written into the run folder, where they come from several files, from such a file, or from no file.
+    `FILE` lies in the run folder itself; `effects_source` is its text.
     """
-    origins = {e.origin or run.effects_file or FILE for e in own_effects(run)}
-    file = origins.pop() if len(origins) == 1 else FILE
-    return None if not own_effects(run) else FILE if Path(file).name == FILE else file
+    origins = {effect.origin or run.effects_file or FILE for effect in own_effects(run)}
+    if not origins:
+        return None
+    file = origins.pop()
+    # Several files become one. A file that is called FILE lies in the folder of another run, which may go.
+    return FILE if origins or Path(file).name == FILE else file
 
 
 def own_effects(run: RunData) -> list[Effect]:
@@ -128,7 +131,7 @@ def effects_source(run: RunData) -> str | None:
         InputError: the source of an effect is not at hand, or would not run on its own.
     """
     own = own_effects(run)
-    if _effects_file(run) != FILE:
+    if recorded_effects_file(run) != FILE:
         return None
     before = Path(own[0].origin or run.effects_file or "")
     return before.read_text(encoding="utf-8") if before.name == FILE else source_of(own)
@@ -230,8 +233,8 @@ def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovarianc
     matrix = np.array(rows, float).reshape(len(names), len(names))
     if not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
         raise InputError(f"{file}: effects_covariance holds no variances; to fix: run `stitch run` again")
-    beside = np.array(known.get("with_hand_eye", []), float)
-    return EffectsCovariance(names, matrix, beside.reshape(6, -1))
+    with_hand_eye = np.array(known.get("with_hand_eye", []), float)
+    return EffectsCovariance(names, matrix, with_hand_eye.reshape(6, -1))
 
 
 def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
@@ -293,12 +296,12 @@ def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
     ]
 
 
-def _labelled_alone(run: RunData) -> bool:
+def _has_labelled_alone(run: RunData) -> bool:
     """Return whether the rms of the run is that of labelled points; beside clouds it is that of the surfaces."""
     return run.targets is not None and run.overlaps is None
 
 
-def _labelled_beside_clouds(run: RunData) -> bool:
+def _has_points_and_clouds(run: RunData) -> bool:
     return run.targets is not None and run.overlaps is not None
 
 
@@ -315,10 +318,6 @@ def _all_views(run: RunData) -> list[ViewRow]:
     for place, item in zip(free, run.left_out, strict=True):
         rows[place] = ViewRow(item.view, item.pose, np.zeros(6), None, item.points)
     return [rows[place] for place in sorted(rows)]
-
-
-def _has_stock(run: RunData) -> bool:
-    return any(scan.stock is not None for scan in run.measurement.capture.scans)
 
 
 def _stock_rows(run: RunData) -> list[StockRow]:
@@ -576,15 +575,15 @@ RESULT = Document(
     Key("axes", list_of(_AXIS), when=attrgetter("session.axes")),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
-    Key("stock", _STOCK.rows(), write=_stock_rows, when=_has_stock),
+    Key("stock", _STOCK.rows(), write=_stock_rows, when=lambda r: any(s.stock for s in r.measurement.capture.scans)),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
     Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
     Key("position_error", _SIZES, "targets.distances", when=attrgetter("targets")),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
-    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_labelled_beside_clouds),
-    Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_labelled_alone),
-    Key("heldout_position_error", _SIZES, "targets.heldout", when=_labelled_alone),
+    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_has_points_and_clouds),
+    Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_has_labelled_alone),
+    Key("heldout_position_error", _SIZES, "targets.heldout", when=_has_labelled_alone),
     Key("convergence", table_of(_NUMBERS), of=Fit),
     Key("disagreement", _DISAGREEMENT, write=_disagreement, optional=True),
     Key("plain", write=lambda run: run_verdict(run, model_history(run))),

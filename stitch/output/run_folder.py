@@ -209,7 +209,8 @@ def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
         InputError: another process writes there.
     """
     kept = _place_of_fit(path, effects)
-    if kept is None or not all((kept / name).is_file() for name in ("ledger.json", "recording.rrd")[: 1 + recording]):
+    needed = ("ledger.json", "recording.rrd") if recording else ("ledger.json",)
+    if kept is None or not all((kept / name).is_file() for name in needed):
         return False
     with lock_run_folder(path), replace_run_files(path) as scratch:
         # No links: who edits model.toml where it stands would edit the kept one.
@@ -315,9 +316,9 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
         tolerance: within which the views have to agree on the part, length_unit.
     """
     # The page, which takes longest, is made while all else is written.
-    with ThreadPoolExecutor(2) as beside:
-        page = beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
-        points = beside.submit(_write_points, run, folder)
+    with ThreadPoolExecutor(2) as threads:
+        page = threads.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
+        points = threads.submit(_write_points, run, folder)
         write_numbers(run, folder)
         page.result()
         points.result()

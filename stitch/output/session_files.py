@@ -154,7 +154,9 @@ def table_text(columns: TableColumns, exact: bool = False) -> str:
     def cell(value: object) -> object:
         if not isinstance(value, float):
             return value
-        return f"{value:.12g}" if not exact else repr(float(value)) if math.isfinite(value) else ""
+        if not exact:
+            return f"{value:.12g}"
+        return repr(float(value)) if math.isfinite(value) else ""
 
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

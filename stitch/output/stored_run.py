@@ -80,7 +80,7 @@ def trusted_model(
     Raises:
         InputError: no model, a value in it that is no number, or a file of effects that nobody has allowed.
     """
-    model = replace(read_model(path), effects_covariance=_covariance_beside(path, result))
+    model = replace(read_model(path), effects_covariance=_stored_covariance(path, result))
     file = path / "model.toml" if path.is_dir() else path
     for effect, parameters in model.effects.items():
         for name, parameter in parameters.items():
@@ -101,7 +101,7 @@ def trusted_model(
     return model, None
 
 
-def _covariance_beside(path: Path, result: dict[str, Any] | None) -> EffectsCovariance:
+def _stored_covariance(path: Path, result: dict[str, Any] | None) -> EffectsCovariance:
     """Return the covariance of the effects' parameters from the result.json beside a model.toml.
 
     The folder of several sessions has a result.json in each inner folder: the first one is taken, since they share

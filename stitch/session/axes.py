@@ -94,7 +94,7 @@ class Axes:
 
     @property
     def per_metre(self) -> float:
-        """Lengths in a metre."""
+        """Length units per metre."""
         return 1 / METRES[self.length_unit]
 
     @property
@@ -117,7 +117,7 @@ class Axes:
         return axis.carries == ("robot" if self.has_robot else "part")
 
     def as_read(self) -> AxisMotion:
-        """Return the motion by the readings alone, without errors."""
+        """Return the motion of the axes as their readings say, without errors."""
         V, K = self.readings.shape
         return AxisMotion(self.readings, np.zeros((K, 6)), np.zeros((K, 3)), np.zeros((V, K, 6)))
 
@@ -132,8 +132,7 @@ class Axes:
         """
         motion = motion or self.as_read()
         count = len(motion.readings)
-        left = np.tile(np.eye(4), (count, 1, 1))
-        right = left
+        left = right = np.tile(np.eye(4), (count, 1, 1))
         for k, axis in enumerate(self.axes):
             if not axis.is_placed:
                 continue

@@ -10,7 +10,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.axes import Axes, Axis
-from stitch.session.session import SessionData
+from stitch.session.session import SessionData, View
 
 
 def axes_of(session: SessionData) -> Axes:
@@ -38,6 +38,22 @@ def axis_readings(axes: Sequence[Axis], covariates: Mapping[str, float], length_
     """
     columns = [axis.columns(length_unit) for axis in axes]
     return np.array([next(covariates[c] * size for c, size in of.items() if c in covariates) for of in columns])
+
+
+def require_readings(views: Sequence[View], axes: Sequence[Axis], length_unit: str) -> None:
+    """Refuse a view whose covariates do not hold exactly one of the possible columns of each axis.
+
+    Raises:
+        InputError: names the view and the axis.
+    """
+    for axis in axes:
+        columns = axis.columns(length_unit)
+        for view in views:
+            if len(columns.keys() & view.covariates.keys()) != 1:
+                raise InputError(
+                    f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with "
+                    f"{' or '.join(columns)}, one number a view"
+                )
 
 
 def place_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData:

@@ -31,9 +31,10 @@ from stitch.system.values import take_rows
 _USUAL_SIGMA_M = 1e-5
 # A probe's own targets lie some 20 cm apart: that is how well it knows its direction, unless it says so itself.
 _PROBE_LEVER_M = 0.2
-# Views times the square of the points of each, 72 bytes of covariance for each, and the fewest points of a view: a pose
-# scatters by more than a dozen points show of it.
-_MOST_PRODUCTS, _FEWEST_POINTS = 8e5, 12
+# V·k² pairs of points of one view, k a view: each takes 72 bytes of covariance.
+_MOST_PRODUCTS = 8e5
+# So many points of a view stay in any case: more than a dozen say little more of a pose that scatters.
+_FEWEST_POINTS = 12
 # Points of a session whose neighbours may all be held at once, 70 bytes each.
 _AT_ONCE = 1_000_000
 
@@ -71,16 +72,18 @@ class Sightings:
         """
         if count >= self.target.shape[1]:
             return self
-        slots = np.full((len(self.target), count), -1)
+        slots = np.full((len(self.target), count), -1)  # of each view the slots that stay; −1 where it shows fewer
         for view, target in enumerate(self.target):
             seen = np.flatnonzero(target >= 0)
             if len(seen) > count:
                 seen = seen[(view + np.arange(count) * len(seen) // count) % len(seen)]
             slots[view, : len(seen)] = seen
-        rows, there = np.arange(len(slots))[:, None], slots >= 0
-        points = np.where(there[..., None], self.points[rows, slots], 0.0)
-        target, used = np.where(there, self.target[rows, slots], -1), self.used[rows, slots] & there
-        return replace(self, target=target, points=points, sigma=self.sigma[rows, slots], used=used)
+        view = np.arange(len(slots))[:, None]
+        is_filled = slots >= 0
+        target = np.where(is_filled, self.target[view, slots], -1)
+        points = np.where(is_filled[..., None], self.points[view, slots], 0.0)
+        used = self.used[view, slots] & is_filled
+        return replace(self, target=target, points=points, sigma=self.sigma[view, slots], used=used)
 
     def without(self, left_out: Indices) -> "Sightings":
         """Return the sightings without the views at the indices `left_out`."""
@@ -204,10 +207,10 @@ def prepare_capture(session: SessionData) -> Capture:
     sightings = sightings_of(session)
     if sightings is not None and not scans:
         sightings = sightings.at_most(max(int(np.sqrt(_MOST_PRODUCTS / len(sightings.target))), _FEWEST_POINTS))
-    return of_scanners(session, build_capture(session.name, scans, T_base_flange, session.mount, sightings))
+    return with_scanners(session, build_capture(session.name, scans, T_base_flange, session.mount, sightings))
 
 
-def of_scanners(session: SessionData, capture: Capture) -> Capture:
+def with_scanners(session: SessionData, capture: Capture) -> Capture:
     """Return the capture with the scanner and stop of each view, if the session joins several scanners; else as it is.
 
     `T_behind_mount` places each further scanner as its own session states it.

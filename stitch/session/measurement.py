@@ -43,7 +43,7 @@ _WIDEST = 0.26
 # Points of a view that say where a sensor looks.
 _ENOUGH = 1000
 # Fields of `Views` with a row a view.
-_OF_VIEWS = ("time", "joints", "previous", "approach", "velocity", "covariates", "number", "T_base_flange")
+_ROWS_OF_VIEWS = ("time", "joints", "previous", "approach", "velocity", "covariates", "number", "T_base_flange")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Views:
         return self.covariates[covariate] - self.first[covariate]
 
     def behind(self, joint: int, play: float) -> Array:
-        """Return by how much the driven side of a joint lags behind its angle, (V,) rad, with friction and play.
+        """Return the lag (V,) rad of a joint with friction and play: angle of its driven side less that of its motor.
 
         The driven side rests until the joint is `play` away, then follows at that distance: the play operator (Krejčí
         1996, "Hysteresis, Convexity and Dissipation in Hyperbolic Equations", ch. II). So it depends on all reversals,
@@ -144,11 +144,11 @@ class Views:
             play: half width of the dead band, rad.
         """
         # The driven side's angle before the first view, and after each view of the whole session.
-        states = np.append(np.nan, self.path[:, joint])
-        for v, at in enumerate(self.path[1:, joint], start=2):
-            states[v] = min(max(states[v - 1], at - play), at + play)
+        driven = np.append(np.nan, self.path[:, joint])
+        for v, angle in enumerate(self.path[1:, joint], start=2):
+            driven[v] = min(max(driven[v - 1], angle - play), angle + play)
         q = self.joints[:, joint]
-        before = states[self.number]
+        before = driven[self.number]
         return np.where(self.number > 0, np.clip(before, q - play, q + play) - q, 0.0)
 
     @property
@@ -169,7 +169,7 @@ class Views:
         selection.
         """
         return replace(
-            take_rows(self, keep, *_OF_VIEWS, *(["gravity"] if self.gravity.ndim > 1 else [])),
+            take_rows(self, keep, *_ROWS_OF_VIEWS, *(["gravity"] if self.gravity.ndim > 1 else [])),
             count=len(keep),
             torques=self.torques.only(keep),
             axes=self.axes.only(keep) if self.axes else self.axes,
@@ -337,7 +337,7 @@ def measurement_of(session: SessionData, capture: Capture) -> Measurement:
 
 
 def _intensities(session: SessionData) -> list[Array | None]:
-    """Return per view intensities (N,) standardised over the session, (I − Ī)/σ_I; None where they do not count."""
+    """Return per view intensities (N,) standardised over the session, (I − Ī)/σ_I; None in all if one view has none."""
     scale = intensity_scale(session)
     if scale is None:
         return [None] * len(session.views)
@@ -416,7 +416,7 @@ def views_of(session: SessionData) -> Views:
         number=np.arange(count),
         path=joints,
         T_base_flange=np.array([view.T_base_flange for view in views]),
-        gravity=_gravity_left_of(axes, session),
+        gravity=_gravity_of_views(axes, session),
         axes=axes,
         eye_to_hand=session.mount == "eye_to_hand",
         names=tuple(session.names),
@@ -428,10 +428,11 @@ def views_of(session: SessionData) -> Views:
     )
 
 
-def _gravity_left_of(axes: Axes, session: SessionData) -> Array:
-    """Return gravity as unit vectors in the frame that the effective poses map to: (3,), or (V, 3) if an axis turns it.
+def _gravity_of_views(axes: Axes, session: SessionData) -> Array:
+    """Return gravity as unit vectors in the frame to which the effective poses map the flange: (3,), or (V, 3).
 
-    That is the base, or the part that axes carry: A_left⁻¹ · gravity. Zero without a robot, where it is not known.
+    Without external axes it is the base's, (3,). Where axes carry the part it is the part's: A_left⁻¹ · gravity in each
+    view. Zero without a robot, where the direction is not known.
     """
     if not session.has_poses:
         return np.zeros(3)

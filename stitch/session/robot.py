@@ -237,16 +237,17 @@ def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
     still = np.zeros((len(joints), 3))
     scale = np.zeros((len(joints), 6))
     slopes = dict[str, list[Array]](joints=[], lengths=[], da=[], dd=[], dalpha=[])
-    for (before, turned, after, moved), factor in zip(chain, links.lengths.T, strict=True):
+    for link, factor in zip(chain, links.lengths.T, strict=True):
         # Additions to a and d are lengths of the link: the factors multiply them too.
-        reach = (links.scale * factor)[:, None]
-        row = before if modified else after  # the frame at whose x axis da and dalpha act
-        slopes["joints"].append(_screw(T, turned, turned[..., :3, _Z], still))
-        slopes["da"].append(_screw(T, row, still, reach * row[..., :3, _X]))
+        stretch = (links.scale * factor)[:, None]
+        row = link.before if modified else link.end  # the frame along whose x axis da and dalpha act
+        slopes["joints"].append(_screw(T, link.turned, link.turned[..., :3, _Z], still))
+        slopes["da"].append(_screw(T, row, still, stretch * row[..., :3, _X]))
         slopes["dalpha"].append(_screw(T, row, row[..., :3, _X], still))
-        # d lies along the joint's own axis: ahead of `after`, or, modified, at its end.
-        slopes["dd"].append(_screw(T, after, still, reach * (after if modified else turned)[..., :3, _Z]))
-        longer = _screw(T, after, still, moved)
+        # d lies along z of the joint after its rotation, in the modified convention along z of the link's end.
+        along_d = (link.end if modified else link.turned)[..., :3, _Z]
+        slopes["dd"].append(_screw(T, link.end, still, stretch * along_d))
+        longer = _screw(T, link.end, still, link.reach)
         scale += longer / links.scale[:, None]
         slopes["lengths"].append(longer / factor[:, None])
     return FlangeSlopes(scale=scale, **{name: np.stack(by_joint, axis=-1) for name, by_joint in slopes.items()})
@@ -278,8 +279,8 @@ def _chain(robot: Robot, joints: Array, links: Links) -> list[_Link]:
         first = T @ _scaled(before, scale)
         turned = first @ elementary("z", joints[:, i] + robot.theta[i])
         last = turned @ _scaled(after, scale)
-        moved = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
-        chain.append(_Link(first, turned, last, moved))
+        reach = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
+        chain.append(_Link(first, turned, last, reach))
         T = last
     return chain
 

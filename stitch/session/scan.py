@@ -1,6 +1,5 @@
 """A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -252,26 +251,27 @@ def fit_planes(points: Array, index: Indices) -> LocalPlanes:
 
 
 def _weakest_directions(C: Array) -> tuple[Array, Array]:
-    """Return unit eigenvectors (N, 3) of the smallest eigenvalues of covariances C (3, 3, N), and these over traces.
+    """Return unit eigenvectors (N, 3) of the smallest eigenvalues λ of covariances C (3, 3, N), and λ over the traces.
 
-    The eigenvalues are the roots of a cubic in closed form (Smith 1961). All rows of C − λ are orthogonal to the
-    eigenvector: the longest cross product of two of them gives it. Where all are short, as of points along a line, a
-    library's decomposition is used.
+    With mean eigenvalue m, B = C − m, p² = tr B²/6 and cos 3φ = det B/(2p³) the eigenvalues are m + 2p cos(φ + 2πk/3)
+    (Smith 1961). All rows of C − λ are orthogonal to the eigenvector: the longest cross product of two of them gives
+    it. Where all are short, as of points along a line, a library's decomposition is used.
     """
     scaled = C / np.maximum(np.trace(C), 1e-300)
-    mean, one = np.trace(scaled) / 3, np.eye(3)[:, :, None]
-    off = scaled - one * mean
-    p = np.maximum(np.sqrt((off**2).sum(axis=(0, 1)) / 6), 1e-100)
-    det = (off[0] * _cross(off[1], off[2])).sum(axis=0)
-    angle = np.arccos(np.clip(det / (2 * p**3), -1.0, 1.0)) / 3
+    mean = np.trace(scaled) / 3
+    identity = np.eye(3)[:, :, None]
+    B = scaled - identity * mean
+    p = np.maximum(np.sqrt((B**2).sum(axis=(0, 1)) / 6), 1e-100)
+    determinant = (B[0] * _cross(B[1], B[2])).sum(axis=0)
+    angle = np.arccos(np.clip(determinant / (2 * p**3), -1.0, 1.0)) / 3
     smallest, largest = (mean + 2 * p * np.cos(angle + turn) for turn in (2 * np.pi / 3, 0.0))
-    left = scaled - one * smallest
-    across = np.array([_cross(left[i], left[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
-    square = (across**2).sum(axis=1)
-    best = square.argmax(axis=0)
-    every = np.arange(len(best))
-    length = np.sqrt(square[best, every])
-    normals = across[best, :, every] / np.maximum(length, 1e-300)[:, None]
+    rows = scaled - identity * smallest
+    products = np.array([_cross(rows[i], rows[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
+    square = (products**2).sum(axis=1)
+    longest = square.argmax(axis=0)
+    every = np.arange(len(longest))
+    length = np.sqrt(square[longest, every])
+    normals = products[longest, :, every] / np.maximum(length, 1e-300)[:, None]
     unclear = np.flatnonzero(length <= _CLEARLY_PLANE * largest**2)
     if len(unclear):
         values, vectors = np.linalg.eigh(scaled[:, :, unclear].transpose(2, 0, 1))
@@ -295,9 +295,9 @@ def _estimate_noise(points: Array, centres: Array, normals: Array, index: Indice
     if count <= 8:
         return float("nan")
     sample = even_indices(len(centres), _NOISE_SAMPLES)
-    rest, _, parameter_counts = _fit_quadrics(points, centres[sample], normals[sample], index[sample])
-    degrees = count - parameter_counts()
-    variance = (rest**2).sum(axis=0) / degrees
+    quadrics = _fit_quadrics(points, centres[sample], normals[sample], index[sample])
+    degrees = count - quadrics.parameter_counts()
+    variance = (quadrics.residuals**2).sum(axis=0) / degrees
     # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance / (1 - 2 / (9 * degrees)) ** 3)))
 
@@ -317,14 +317,31 @@ def _bent_normals(points: Array, centres: Array, normals: Array, index: Indices)
     out = np.empty_like(normals)
     for start in range(0, len(centres), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
-        out[at] = _fit_quadrics(points, centres[at], normals[at], index[at])[1]
+        out[at] = _fit_quadrics(points, centres[at], normals[at], index[at]).normals
     return out
 
 
-def _fit_quadrics(
-    points: Array, centres: Array, normals: Array, index: Indices
-) -> tuple[Array, Array, Callable[[], Array]]:
-    """Return residuals and normals of quadrics fitted to the k neighbours of each of N points.
+class _Quadrics(NamedTuple):
+    """Quadrics fitted to the k neighbours of each of N points, with m = 5 terms besides a constant."""
+
+    residuals: Array  # (k, N) along the normals of the local planes, length_unit
+    normals: Array  # (N, 3) unit, at the points
+    penalty: Array  # (m, m, N) μW of `_fit_quadrics`
+    factors: Array  # (m, m, N) Cholesky factors of S + μW
+
+    def parameter_counts(self) -> Array:
+        """Return the effective number of parameters (N,) of each fit: 1 + m − tr R⁴.
+
+        R = (S + μW)⁻¹μW is what one of the two rounds of `_fit_quadrics` leaves of the coefficients.
+        """
+        m = len(self.penalty)
+        left = np.stack([_cholesky_solve(self.factors, self.penalty[:, j]) for j in range(m)], axis=1)
+        twice = np.einsum("ijn,jkn->ikn", left, left)
+        return 1 + m - np.einsum("ijn,jin->n", twice, twice)
+
+
+def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices) -> _Quadrics:
+    """Return quadrics fitted to the k neighbours of each of N points.
 
     In axes x, y across the normal the height over the plane is a constant plus c·(x, y, x², √2·xy, y²). Least squares
     with a small penalty: c = (S + μW)⁻¹q, and once more for the residuals (iterated Tikhonov), with μ `_NOT_SHOWN`. S
@@ -336,10 +353,6 @@ def _fit_quadrics(
         centres: (N, 3) points to whose neighbours the quadrics are fitted.
         normals: (N, 3) unit normals of the local planes.
         index: (N, k) indices of each centre's neighbours among all points.
-
-    Returns:
-        Residuals (k, N) along the normals, length_unit; unit normals (N, 3) of the quadrics at the centres; a function
-        that returns the effective number of parameters (N,) of each fit, which not all callers need.
     """
     local = np.array([column[index.T] for column in points.T]) - centres.T[:, None]
     n = normals.T
@@ -347,32 +360,30 @@ def _fit_quadrics(
     # A point without a normal (zero) has no axes either: division by zero is avoided.
     a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     b = _cross(n, a)
-    x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
+    x, y, heights = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
     scale = np.sqrt(np.maximum((x * x + y * y).max(axis=0), 1e-300))
     x, y = x / scale, y / scale
     terms = np.array([x, y, x * x, np.sqrt(2) * x * y, y * y])
-    whole = _normal_matrices(terms)
-    whole[:2, 2:] = whole[2:, :2] = 0.0
-    for part in (slice(0, 2), slice(2, 5)):
-        whole[part, part] += _ROUNDING * np.eye(part.stop - part.start)[..., None] * np.einsum("iin->n", whole)
+    penalty = _NOT_SHOWN * _orders_apart(_normal_matrices(terms))
     terms -= terms.mean(axis=1, keepdims=True)
-    rest -= rest.mean(axis=0)
-    solve = _solver(_normal_matrices(terms) + _NOT_SHOWN * whole)
+    residuals = heights - heights.mean(axis=0)
+    factors = _cholesky_factors(_normal_matrices(terms) + penalty)
     slope = np.zeros((2, x.shape[1]))
     for _ in range(2):
-        coefficients = solve(np.einsum("ikn,kn->in", terms, rest))
-        rest -= np.einsum("ikn,in->kn", terms, coefficients)
+        coefficients = _cholesky_solve(factors, np.einsum("ikn,kn->in", terms, residuals))
+        residuals -= np.einsum("ikn,in->kn", terms, coefficients)
         slope += coefficients[:2]
     slope /= scale
     bent = n - slope[0] * a - slope[1] * b
+    return _Quadrics(residuals, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, penalty, factors)
 
-    def parameter_counts() -> Array:
-        """Return 1 + m − tr R⁴ (N,) for m terms, with R = μ(S + μW)⁻¹W what one round leaves of the coefficients."""
-        left = np.stack([solve(_NOT_SHOWN * whole[:, j]) for j in range(len(terms))], axis=1)
-        twice = np.einsum("ijn,jkn->ikn", left, left)
-        return 1 + len(terms) - np.einsum("ijn,jin->n", twice, twice)
 
-    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, parameter_counts
+def _orders_apart(W: Array) -> Array:
+    """Return normal matrices W (5, 5, N) without products of first-order and second-order terms, made invertible."""
+    W[:2, 2:] = W[2:, :2] = 0.0
+    for order in (slice(0, 2), slice(2, 5)):
+        W[order, order] += _ROUNDING * np.eye(order.stop - order.start)[..., None] * np.einsum("iin->n", W)
+    return W
 
 
 def _normal_matrices(terms: Array) -> Array:
@@ -383,25 +394,24 @@ def _normal_matrices(terms: Array) -> Array:
     return out
 
 
-def _solver(A: Array) -> Callable[[Array], Array]:
-    """Return a function that solves A·x = right for N small systems, A (m, m, N) symmetric and positive definite."""
-    # All systems at once by Cholesky factors: a library's loop over them takes several times as long.
-    m = len(A)
+def _cholesky_factors(A: Array) -> Array:
+    """Return lower factors L (m, m, N), A = L·Lᵀ, of N symmetric positive definite matrices A (m, m, N)."""
+    # All at once: a library's loop over the matrices takes several times as long.
     L = np.zeros_like(A)
-    for j in range(m):
+    for j in range(len(A)):
         below = A[j:, j] - np.einsum("ikn,kn->in", L[j:, :j], L[j, :j])
         L[j:, j] = below / np.sqrt(np.maximum(below[0], 1e-300))
+    return L
 
-    def solve(right: Array) -> Array:
-        """Return the solutions (m, N) of right sides (m, N): forward with the Cholesky factors, then backward."""
-        out = np.array(right)
-        for j in range(m):
-            out[j] = (out[j] - np.einsum("kn,kn->n", L[j, :j], out[:j])) / L[j, j]
-        for j in reversed(range(m)):
-            out[j] = (out[j] - np.einsum("kn,kn->n", L[j + 1 :, j], out[j + 1 :])) / L[j, j]
-        return out
 
-    return solve
+def _cholesky_solve(L: Array, right: Array) -> Array:
+    """Return the solutions x (m, N) of L·Lᵀ·x = right (m, N), L (m, m, N): forward, then backward substitution."""
+    x = np.array(right)
+    for j in range(len(L)):
+        x[j] = (x[j] - np.einsum("kn,kn->n", L[j, :j], x[:j])) / L[j, j]
+    for j in reversed(range(len(L))):
+        x[j] = (x[j] - np.einsum("kn,kn->n", L[j + 1 :, j], x[j + 1 :])) / L[j, j]
+    return x
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -68,14 +68,18 @@ def stops_of(session: SessionData) -> Indices:
     views = session.views
     same = same_stop(np.array([view.T_base_flange for view in views]))
     is_in_order = all(view.time_s is not None for view in views)
-    stops = list[list[int]]()
+    stops = list[list[int]]()  # the views of each stop
     for v, view in enumerate(views):
-        among = stops[-1:] if is_in_order else stops
-        shared = [s for s in among if same[v, s[0]] and all(views[w].scanner != view.scanner for w in s)]
-        stops += [] if shared else [[]]
-        (shared or stops[-1:])[0].append(v)
-    # From lists of views per stop to the stop of each view.
-    return np.repeat(np.arange(len(stops)), list(map(len, stops)))[np.argsort(np.concatenate(stops))]
+        candidates = stops[-1:] if is_in_order else stops
+        shared = [s for s in candidates if same[v, s[0]] and all(views[w].scanner != view.scanner for w in s)]
+        if shared:
+            shared[0].append(v)
+        else:
+            stops.append([v])
+    stop_of_view = np.empty(len(views), np.int64)
+    for number, stop in enumerate(stops):
+        stop_of_view[stop] = number
+    return stop_of_view
 
 
 def scanner_of(session: SessionData, view: View) -> Scanner:

@@ -14,7 +14,7 @@ from stitch.system.values import take_rows
 
 PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
 # So many joint angles show which torques of an arm differ.
-_ANYWHERE = 100
+_SAMPLES = 100
 STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
 
 
@@ -79,16 +79,16 @@ def _base_moments(robot: Robot, joints: Array, payload: Array | None) -> dict[st
     Args:
         payload: (V,) kg; None: the mass in [robot] payload.
     """
-    of_kg = kinematics.base_moments(robot, joints)[..., :2]  # (V, n + 1, 2) of 1 kg at each link, the payload's last
+    per_kg = kinematics.base_moments(robot, joints)[..., :2]  # (V, n + 1, 2) of 1 kg at each link, the payload's last
     load = np.full(len(joints), robot.payload_mass) if payload is None else payload
-    moments = load[:, None] * of_kg[:, -1]
+    moments = load[:, None] * per_kg[:, -1]
     columns = list[tuple[str, int, Array]]()  # name, axis and moments (V,) of each
     if robot.has_masses:
-        moments = moments + np.einsum("k,vki->vi", robot.mass, of_kg[:, :-1])
+        moments = moments + np.einsum("k,vki->vi", robot.mass, per_kg[:, :-1])
     else:
         shapes = kinematics.base_moments(robot, _sample_joints(robot))[:, :-1]
         links = [(i, k) for i in range(2) for k in _independent_links(shapes[..., i], range(robot.n_joints))]
-        columns = [(f"_{'xy'[i]}_{k + 1}", i, of_kg[:, k, i]) for i, k in links]
+        columns = [(f"_{'xy'[i]}_{k + 1}", i, per_kg[:, k, i]) for i, k in links]
     if robot.has_masses or load.any():
         columns += [(f"_{'xy'[i]}", i, moments[:, i]) for i in range(2)]
     values = np.array([value for *_, value in columns]).T.reshape(len(joints), len(columns))
@@ -137,7 +137,7 @@ def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
 
 def _sample_joints(robot: Robot) -> Array:
     """Return fixed random joint angles (N, n), rad: which torques differ is then the same in all sessions of an arm."""
-    return np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, robot.n_joints))
+    return np.random.default_rng(0).uniform(-np.pi, np.pi, (_SAMPLES, robot.n_joints))
 
 
 def torques_of_views(robot: Robot, joints: Array, covariates: Mapping[str, Array]) -> Torques:

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from typing import IO, TYPE_CHECKING, TypeVar
 
@@ -90,16 +90,21 @@ def tell_seconds(step: str) -> Iterator[None]:
 
 
 @contextmanager
-def answers_to(stream: Callable[[], IO[str]]) -> Iterator[None]:
+def held_last(stack: list[Item], item: Item) -> Iterator[None]:
+    """Keep an item at the end of a list while the block lasts."""
+    stack.append(item)
+    try:
+        yield
+    finally:
+        stack.pop()
+
+
+def answers_to(stream: Callable[[], IO[str]]) -> AbstractContextManager[None]:
     """Send what people read to the stream that `stream()` returns while the block lasts, not to standard error.
 
     For commands whose text is their result, and so belongs on standard output.
     """
-    _answers.append(stream)
-    try:
-        yield
-    finally:
-        _answers.pop()
+    return held_last(_answers, stream)
 
 
 def answer_stream() -> IO[str] | None:

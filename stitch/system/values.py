@@ -99,8 +99,10 @@ def take_rows(item: Item, index: Any, *names: str) -> Item:
 
     def rows(held: Any) -> Any:
         """Return the rows at `index` of the value of one field."""
-        if held is None or isinstance(held, tuple):
-            return held and tuple(held[i] for i in index)
+        if held is None:
+            return None
+        if isinstance(held, tuple):
+            return tuple(held[i] for i in index) if held else ()
         return {name: column[index] for name, column in held.items()} if isinstance(held, dict) else held[index]
 
     return replace(item, **{name: rows(getattr(item, name)) for name in names})  # type: ignore[type-var]

@@ -15,7 +15,7 @@ from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
 from stitch.output.diagnosis_document import diagnosis_document, named_before
 from stitch.output.json_file import write_json
-from stitch.output.plain_finding import suggested_command
+from stitch.output.plain_finding import next_step_line
 from stitch.output.run_folder import write_with_page
 from stitch.output.stored_run import diagnosed_state, load_run, standing_diagnosis
 from stitch.session.reading.session_folder import load_session
@@ -125,7 +125,7 @@ def test_an_effect_that_was_dropped_is_remembered_and_not_proposed_again(monkeyp
     result, lines, found = stepwise.suggest(first, at_most=3)
     assert result is None and "joint_offset was tried and dropped: with joint_offset the error" in lines[-1]
     assert list(found.tried) == ["joint_offset"] and "It was tried in this run and dropped: with" in said(found)
-    assert "--suggested" not in suggested_command(found, "RUN")
+    assert "--suggested" not in next_step_line(found, "RUN")
     # In a later process too, as diagnosis.json of the run has it.
     (tmp_path / "run").mkdir()
     write_with_page(first, tmp_path / "run")

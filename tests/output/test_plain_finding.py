@@ -19,7 +19,7 @@ from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from stitch.output.comparison.run_verdict import prediction_text
 from stitch.output.diagnosis_document import DIAGNOSIS
-from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
+from stitch.output.plain_finding import largest_error_sources, next_step_line, plain_finding, remedy_at_machine
 from stitch.output.plain_words import effect_in_words
 from stitch.screening.pose_tests import PoseStep
 from viz.review.run_snapshot import told_diagnosis
@@ -49,7 +49,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve,
     monkeypatch.setattr("stitch.output.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
     more = {"curves": curves, "time_curve": time_curve, "linear": None, "follows_field": follows_field}
     found = finding(verdict, **more)
-    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    command = next_step_line(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
     explained = verdict == "unknown_effect" and bool(curves or time_curve) and not follows_field
     assert ("explain" in command) == explained
@@ -65,7 +65,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     found = finding("cannot_tell", "play", candidates=(cause,), sentence="", linear=linear)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: pytest.fail("it is added"))
-    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    command = next_step_line(found, "RUN").rsplit(": ", 1)[1]
     assert refused(command) is None and ("--group" in command) == (share < 0.95)
     if share > 0.95:
         model = SimpleNamespace(effects=[])
@@ -75,7 +75,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
 def test_where_a_view_decides_it_comes_before_a_group():
     """On the terminal as on the page; the review's main button is this command."""
     found = finding("cannot_tell", "play", "sag", next=(SimpleNamespace(probability=0.7),))
-    command = suggested_command(found, "RUN")
+    command = next_step_line(found, "RUN")
     assert command.endswith(": stitch next RUN -o next.src")
     document = {"verdict": "cannot_tell", "effects": ["play", "sag"], "plain": "", "sentence": ""}
     assert told_diagnosis(document | {"next_command": command}, 1e3)["advised"] == "next"
@@ -96,7 +96,7 @@ def test_a_table_holds_no_number_that_did_not_decide():
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 def test_no_model_is_built_on_a_doubtful_session(verdict):
     found = finding(verdict, "backlash", curves=("of joint 3",), doubts=("knocked",))
-    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    command = next_step_line(found, "RUN").rsplit(": ", 1)[1]
     assert command == "stitch review RUN" and refused(command) is None
 
 
@@ -109,7 +109,7 @@ def test_a_step_that_is_named_is_no_doubt_beside_it(moved, distinguishable, furt
     step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
     found = finding("missing_effect", named, doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further))
     same = distinguishable and named == ("part_slip" if moved == "part" else "mount_step")
-    told, command = plain_finding(found, "mm"), suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    told, command = plain_finding(found, "mm"), next_step_line(found, "RUN").rsplit(": ", 1)[1]
     assert (f"{named} (from view c on the {moved} sits elsewhere, " in told) == same
     assert told.count("sits elsewhere") == 1
     assert ("may only be consequences" in told) == (not same or bool(further))

@@ -232,7 +232,7 @@ def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_aga
     monkeypatch.setattr(stepwise, "suggest", suggest)
     monkeypatch.setattr("stitch.cli.change.recorder_for", told_to)
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
-    monkeypatch.setattr("stitch.output.plain_finding.suggested_command", lambda found, run: "")
+    monkeypatch.setattr("stitch.output.plain_finding.next_step_line", lambda found, run: "")
     stitch_command("add", run, "--suggested")
     assert told_of == [("fit", 0), {"backlash": "idle"}]
     steps = json.loads((run / "ledger.json").read_text())

@@ -18,7 +18,7 @@ from stitch.numerics import frames
 from stitch.observations.surfaces.hand_eye_fit import Repeatability, pose_covariance
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.output.comparison.run_verdict import run_light, run_verdict
-from stitch.output.plain_finding import plain_finding, suggested_command
+from stitch.output.plain_finding import next_step_line, plain_finding
 from stitch.output.result_document import model_of
 from stitch.screening.hand_eye_anywhere import hand_eye_sigma_anywhere
 from stitch.screening.model_transfer import compare_with_own_effects
@@ -87,7 +87,7 @@ def test_a_diagnosis_says_first_what_is_doubted(cell):
     found = diagnose(moved)
     assert found.doubts == moved.doubts
     assert plain_finding(found, "mm").startswith("The hand-eye of the other run does not hold here. The findings below")
-    assert suggested_command(found, "RUN").startswith("Next: fix the problem above")
+    assert next_step_line(found, "RUN").startswith("Next: fix the problem above")
     # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
     assert not diagnose(change(moved, ["joint_offset"])).doubts
 

@@ -100,7 +100,7 @@ def _mean_over_views(values: Array) -> Array:
     return np.where(count > 1, np.where(seen, values, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
-def patches_of(matches: Sequence[Match], views: int, scale: float, model_distances: Array) -> "Patches":
+def patches_of(matches: Sequence[Match], view_count: int, scale: float, model_distances: Array) -> "Patches":
     """Return patches over the surface that the matches cover, as small as the noise allows.
 
     The radii `_RADII`, shares of the part's longest side, are tried in growing order. The first is taken whose standard
@@ -109,11 +109,11 @@ def patches_of(matches: Sequence[Match], views: int, scale: float, model_distanc
 
     Args:
         matches: M correspondences of all overlapping pairs, at the registered poses: distances there are noise.
-        views: number V of views.
+        view_count: number V of views.
         scale: robust sigma of the distances, length_unit; those beyond `RMS_GATE` times it are edges and are dropped.
         model_distances: (M,) distances under the model whose field is to be drawn, length_unit.
     """
-    pairs = _Correspondences(matches, views, scale)
+    pairs = _Correspondences(matches, view_count, scale)
     # Of all points but a hundredth: single ones far off would make the part longer.
     longest_side = float(np.ptp(np.quantile(pairs.middle, [0.005, 0.995], axis=1), axis=0).max())
     for share in _RADII:
@@ -127,15 +127,15 @@ def patches_of(matches: Sequence[Match], views: int, scale: float, model_distanc
 class _Correspondences:
     """The R correspondences of M whose distance is inside the robust gate, at the poses of the matches."""
 
-    def __init__(self, matches: Sequence[Match], views: int, scale: float) -> None:
+    def __init__(self, matches: Sequence[Match], view_count: int, scale: float) -> None:
         """Join the arrays of all matches, in their order.
 
         Args:
             matches: M correspondences, v less w.
-            views: number V of views.
+            view_count: number V of views.
             scale: robust sigma of the distances, length_unit.
         """
-        self.views = views
+        self.view_count = view_count
         self.distances = np.concatenate([m.residual for m in matches])  # (M,)
         self.inside: Mask = np.abs(self.distances) < RMS_GATE * scale  # (M,)
         # Coordinates first: sums and limits over rows of three take several times as long.
@@ -160,9 +160,9 @@ class Patches:
         """
         cell, centre, facing = _group_points(pairs.middle, pairs.normal, pairs.side, _CELL * radius)
         self._inside = pairs.inside
-        self._cell_of = np.concatenate([cell, cell]) * pairs.views + pairs.view
-        counts = np.bincount(self._cell_of, minlength=len(centre) * pairs.views)
-        self._counts = counts.reshape(len(centre), pairs.views).astype(float)  # (C, V)
+        self._cell_of = np.concatenate([cell, cell]) * pairs.view_count + pairs.view
+        counts = np.bincount(self._cell_of, minlength=len(centre) * pairs.view_count)
+        self._counts = counts.reshape(len(centre), pairs.view_count).astype(float)  # (C, V)
         sides = _facing_side(facing.T)
         _, self.points, self.normals = _group_points(centre.T, facing.T, sides, _APART * radius)  # (K, 3), outwards
         self.radius = radius  # standard deviation of the weights, length_unit
@@ -181,7 +181,7 @@ class Patches:
         sums = np.bincount(self._cell_of, np.concatenate([e, -e]), self._counts.size)
         return sums.reshape(self._counts.shape).astype(float)
 
-    def _standard_errors(self, quiet: Array) -> Array:
+    def _standard_errors(self, distances: Array) -> Array:
         """Return standard errors (V, K) of each view's mean in each patch, by the scatter of the cells' means about it.
 
         With weights a of the cells (kernel times counts), means m of the cells and d of the patch, the variance is
@@ -189,17 +189,17 @@ class Patches:
         are correlated, since they share points; cells are wide enough to be independent.
 
         Args:
-            quiet: (M,) distances at the registered poses, length_unit.
+            distances: (M,) at the registered poses, length_unit, where they are noise.
         """
         kernel, n = self._kernel, self._counts
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.nan_to_num(self._sums(quiet) / n)
+            mean = np.nan_to_num(self._sums(distances) / n)
             total = kernel @ n
             value = kernel @ (n * mean) / total
-            square = kernel.multiply(kernel).tocsr()
-            a2 = n**2
-            spread = square @ (a2 * mean**2) - 2 * value * (square @ (a2 * mean)) + value**2 * (square @ a2)
-            cells = total**2 / (square @ a2)
+            # Σ a² (m − d)² multiplied out, each sum over the cells a product of sparse matrices.
+            kernel2, n2 = kernel.multiply(kernel).tocsr(), n**2
+            spread = kernel2 @ (n2 * mean**2) - 2 * value * (kernel2 @ (n2 * mean)) + value**2 * (kernel2 @ n2)
+            cells = total**2 / (kernel2 @ n2)
             sigma = np.sqrt(np.maximum(spread, 0) * cells / (cells - 1)) / total
         return np.where(cells > _ENOUGH, sigma, np.nan).T
 

@@ -71,16 +71,16 @@ class Witness:
 
     def sentences(self, length_unit: str) -> list[str]:
         """Return sentences for an auditor: how Open3D registered the scans, and how far it is from the run."""
-        here = _summary(self.to_run)
-        there = _summary(self.from_run)
+        to_run = _summary(self.to_run)
+        from_run = _summary(self.from_run)
         worst = int(np.argmax(self.shift))
         return [
             f"Open3D {self.version} registered the same scans by {self.pairs} pairs and a graph of poses.",
             "It began at the robot's poses under this run's hand-eye, and knows of no robot after that.",
-            f"From its cloud to this one: half within {length_text(here['median'], length_unit)}, "
-            f"95 % within {length_text(here['p95'], length_unit)}.",
-            f"From this cloud to its own: half within {length_text(there['median'], length_unit)}, "
-            f"95 % within {length_text(there['p95'], length_unit)}.",
+            f"From its cloud to this one: half within {length_text(to_run['median'], length_unit)}, "
+            f"95 % within {length_text(to_run['p95'], length_unit)}.",
+            f"From this cloud to its own: half within {length_text(from_run['median'], length_unit)}, "
+            f"95 % within {length_text(from_run['p95'], length_unit)}.",
             f"The views differ by {length_text(float(np.median(self.shift)), length_unit)} and "
             f"{angle_text(float(np.median(self.turn)))} in the median.",
             f"{self.views[worst]} differs most, by {length_text(float(self.shift[worst]), length_unit)}.",
@@ -260,10 +260,10 @@ def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Ar
         meets = np.ones(len(moved), bool)
         for poses in rivals:
             places = frames.transform(frames.inverse(poses[i]) @ poses[j], moved)
-            apart, at = trees[i].query(np.ascontiguousarray(places))
-            meets &= apart < reach
-            at = np.minimum(at, len(clouds[i]) - 1)
-            distances.append(np.einsum("ni,ni->n", places - clouds[i][at], normals[i][at]))
+            distance, nearest = trees[i].query(np.ascontiguousarray(places))
+            meets &= distance < reach
+            nearest = np.minimum(nearest, len(clouds[i]) - 1)
+            distances.append(np.einsum("ni,ni->n", places - clouds[i][nearest], normals[i][nearest]))
         if meets.sum() > _FEWEST:
             medians.append([np.median(np.abs(distance[meets])) for distance in distances])
     return np.array(medians).reshape(-1, 2)

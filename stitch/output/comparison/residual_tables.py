@@ -169,7 +169,9 @@ class ResidualTables(Table, document="stitch.output.comparison.residual_tables:c
         """
         sums = [np.abs(t.mean * t.count)[np.isfinite(t.p_value)] for t in self.places]
         ordered = np.sort(np.concatenate(sums)) if sums else np.zeros(0)
-        return len(ordered) and 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
+        if not len(ordered):
+            return 0
+        return 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
 
     def p_of_all(self, table: ResidualTable) -> float:
         """Return the p-value of a table's clearest mean, times the number of all means (Bonferroni).

@@ -55,11 +55,14 @@ def prediction_text(run: RunData) -> str:
         return ""
     before, predicted, came = run.ledger[-2].heldout_rms, run.ledger[-1].predicted, run.ledger[-1].heldout_rms
     unit = run.session.length_unit
-    told = [length_text(value, unit, 2) for value in (before, predicted, came)]
+    texts = [length_text(value, unit, 2) for value in (before, predicted, came)]
     tenth = _DIFFERS * abs(before - predicted)
-    word = "less was gained" if came > predicted + tenth else "more was gained" if came < predicted - tenth else ""
-    differs = f": {word} than predicted" if word else ", as predicted"
-    return f"Predicted on held-out views: {told[0]} to {told[1]}; it came to {told[2]}{differs}."
+    outcome = ", as predicted"
+    if came > predicted + tenth:
+        outcome = ": less was gained than predicted"
+    elif came < predicted - tenth:
+        outcome = ": more was gained than predicted"
+    return f"Predicted on held-out views: {texts[0]} to {texts[1]}; it came to {texts[2]}{outcome}."
 
 
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:

@@ -18,7 +18,7 @@ from stitch.session.reading.session_folder import UNKNOWN, session_hash
 
 # Probability below which chance does not explain a difference (5 %, as k = 2 covers 95 %).
 _CHANCE = 0.05
-# Points that say how far two hand-eyes put the part apart.
+# So many points at most give the distance between the places where two hand-eyes put the part.
 _POINTS = 20_000
 
 
@@ -63,10 +63,10 @@ class HandEyeChange:
         points = points[:: max(1, len(points) // _POINTS)]
         lever = np.concatenate([-frames.skew(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
         moments = np.einsum("nij,nik->jk", lever, lever) / len(points)
-        apart = frames.transform(D, points) - points
+        displacements = frames.transform(D, points) - points
         self.twist = frames.log(D)
         self.covariance = a.mount_covariance + carried @ b.mount_covariance @ carried.T
-        self.at_part = float(np.sqrt((apart**2).sum(axis=1).mean()))
+        self.at_part = float(np.sqrt((displacements**2).sum(axis=1).mean()))
         self.U_at_part = COVERAGE_FACTOR * float(np.sqrt(np.sum(moments * self.covariance)))
 
     @property
@@ -143,7 +143,7 @@ def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
     """
     gained = [effect for effect in b if effect not in a]
     lost = [effect for effect in a if effect not in b]
-    parts = [f"with {' and '.join(gained)}"] * bool(gained) + [f"without {' and '.join(lost)}"] * bool(lost)
+    parts = [f"{word} {' and '.join(names)}" for word, names in (("with", gained), ("without", lost)) if names]
     difference = " and ".join(parts) or "with the same effects"
     return f"{difference[0].upper()}{difference[1:]} in the model"
 
@@ -156,8 +156,8 @@ def _hand_eye_sentence(change: HandEyeChange, length_unit: str, what: str) -> st
     """
     if not change.twist.any():
         return "Both have the same hand-eye"
-    apart = f"The hand-eyes put the {what} {length_text(change.at_part, length_unit)} apart"
+    distance = f"The hand-eyes put the {what} {length_text(change.at_part, length_unit)} apart"
     if np.isnan(change.p_value):
-        return f"{apart}; their uncertainty is not stated"
+        return f"{distance}; their uncertainty is not stated"
     beyond = "more than" if change.p_value < _CHANCE else "no more than"
-    return f"{apart}, {beyond} their uncertainties explain"
+    return f"{distance}, {beyond} their uncertainties explain"

@@ -26,7 +26,7 @@ from stitch.plugins.cells.job_files import (
     read_job_file,
     require_unique,
 )
-from stitch.session.reading.csv_files import read_csv_lines
+from stitch.session.reading.csv_files import read_csv_rows
 
 DRILL_FORMAT = "stitch-drill/1"
 _FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks", "locating", "trials"}
@@ -186,7 +186,7 @@ def _read_placed_tools(
     """Read where the tool ended; a column image in place of u and v names a picture of each hole."""
     if driven and not file.exists():
         return {}
-    header, _ = read_csv_lines(file)
+    header, _ = read_csv_rows(file)
     if "image" in header and "u" not in header:
         table = read_columns(file, "hole image", f"{POSE_COLUMNS} height")
         H = fit_homography(plate_xyz[:, :2], plate_uv)

@@ -25,7 +25,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.session_files import SessionFiles, TableColumns, write_sessions
-from stitch.session.reading.csv_files import finite_number, read_csv_lines
+from stitch.session.reading.csv_files import finite_number, read_csv_rows
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
 
@@ -166,21 +166,20 @@ def read_columns(file: Path, texts: str, numbers: str) -> CsvColumns:
     Raises:
         InputError: the file, a column or a value is missing or no finite number; names the line.
     """
-    header, lines = read_csv_lines(file)
+    header, rows = read_csv_rows(file)
     for name in (*texts.split(), *numbers.split()):
         if name not in header:
             raise InputError(
                 f"{file}: column {name!r} is missing; to fix: name {texts} {numbers} in the header".rstrip()
             )
-    if not lines:
+    if not rows:
         raise InputError(f"{file}: no rows below the header; to fix: add one per line")
-    rows = [(line, dict(zip(header, cells + [""] * len(header), strict=False))) for line, cells in lines]
     for line, row in rows:
         for name in texts.split():
-            if not row[name].strip():
+            if not row[name]:
                 raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
     return CsvColumns(
-        {name: [row[name].strip() for _, row in rows] for name in texts.split()},
+        {name: [row[name] for _, row in rows] for name in texts.split()},
         {name: np.array([_number(file, line, name, row[name]) for line, row in rows]) for name in numbers.split()},
         len(rows),
     )

@@ -28,7 +28,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.stored_run import read_result
 from stitch.plugins.watch.run_record import Estimate, RunRecord
-from stitch.session.reading.csv_files import is_number, read_csv_lines
+from stitch.session.reading.csv_files import is_number, read_csv_rows
 from stitch.session.reading.views_table import covariate_names
 
 # A time_s beyond counts seconds since 1970 (this is 2001); below, since the session began.
@@ -68,8 +68,7 @@ def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[st
     file = session / "views.csv"
     if not file.is_file():
         return result.stat().st_mtime, "file time of result.json", {}
-    header, lines = read_csv_lines(file)
-    rows = [(line, dict(zip(header, cells, strict=True))) for line, cells in lines]
+    header, rows = read_csv_rows(file)
     if not rows:
         raise InputError(f"{file}: no views; write one row per scan")
     names = [*covariate_names(header, rows), *(["time_s"] if "time_s" in header else [])]

@@ -228,7 +228,9 @@ def _intrinsics(item: Any, where: str) -> Intrinsics:
 
 def _plain(value: Any) -> Any:
     """Return the lists and numbers that a file would hold."""
-    return value.tolist() if hasattr(value, "tolist") else list(value) if isinstance(value, tuple) else value
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
 
 
 def poses_of(poses: Any, where: str) -> Array:
@@ -255,7 +257,7 @@ def poses_of(poses: Any, where: str) -> Array:
     by_rows = _are_motions(T)
     M = T if by_rows else T.transpose(0, 2, 1)
     if not by_rows and not _are_motions(M):
-        raise InputError(f"{where}: {_no_motion(T)}; write a rotation, and 0 0 0 1 in the last row")
+        raise InputError(f"{where}: {_reason_not_rigid(T)}; write a rotation, and 0 0 0 1 in the last row")
     R = M[:, :3, :3]
     if by_rows and _off_orthonormal(R) < _ORTHONORMAL:
         return T
@@ -307,7 +309,7 @@ def _matrices(poses: Any, where: str) -> Array:
         ) from None
 
 
-def _no_motion(T: Array) -> str:
+def _reason_not_rigid(T: Array) -> str:
     """Return why the worst of matrices (V, 4, 4) is no rigid motion: by its rotation, its determinant and last row."""
     R = T[:, :3, :3]
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - _LAST_ROW).max(axis=1)

@@ -138,7 +138,7 @@ def _without_codes(columns: dict[str, Array]) -> tuple[dict[str, Array], tuple[f
     codes = set[float]()
     for axis in "zxy":
         values = np.asarray(columns[axis])
-        while (code := _code(values[~coded] if coded.any() else values)) is not None:
+        while (code := _find_code(values[~coded] if coded.any() else values)) is not None:
             coded |= values == code
             codes.add(code)
     if coded.any():
@@ -147,7 +147,7 @@ def _without_codes(columns: dict[str, Array]) -> tuple[dict[str, Array], tuple[f
     return columns, tuple(sorted(codes))
 
 
-def _code(values: Array) -> float | None:
+def _find_code(values: Array) -> float | None:
     """Return the value among coordinates (N,) that is a code for "nothing measured"; None if there is none.
 
     The least or the largest value, in at least `_CODE_TIMES` points, `_CODE_AWAY` ranges away from the others. These

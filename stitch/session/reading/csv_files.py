@@ -8,23 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from stitch.errors import InputError
+from stitch.numerics.frames import Array
 from stitch.session.reading.text_files import not_utf8, require_file, require_name, shortened
 
 # No quantity of a cell is larger in any unit; beyond, squares overflow.
 _LARGEST = 1e30
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _LONGEST_HEADER = 1 << 20
+# A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
+_UNIT_TOLERANCE = 1e-3
 
 
-def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, and a list of (line number from 1, its cells) of all lines that are not empty.
+def read_csv_rows(file: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the names of the columns, and (line number from 1, column -> cell) of all lines that are not empty.
+
+    Cells have no blanks around them.
 
     Raises:
         InputError: the file is not text, is not separated by commas, a quote stays open, or a row has more or fewer
             cells than the header.
     """
     require_file(file, "write the table")
-    rows: list[tuple[int, list[str]]] = []
+    rows: list[tuple[int, dict[str, str]]] = []
     first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
@@ -36,7 +41,8 @@ def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             for row in reader:
                 if any(cell.strip() for cell in row):
                     _require_cells(file, reader.line_num, row, header)
-                    rows.append((reader.line_num, row))
+                    cells = (cell.strip() for cell in row)
+                    rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
                 first = reader.line_num + 1
     except UnicodeDecodeError:
         raise InputError(not_utf8(file, "CSV UTF-8")) from None
@@ -44,6 +50,23 @@ def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         # A quote that stays open swallows lines until a cell is larger than the csv module allows.
         raise InputError(f"{file} line {first}: {error}; close the quote that opens there") from None
     return header, rows
+
+
+def require_unit_quaternion(where: str, quaternion: Array) -> float:
+    """Return the length of a quaternion (4,), 1 but for the digits that were not written.
+
+    Args:
+        where: file and line, for the message.
+
+    Raises:
+        InputError: another length: something else than a rotation is written there.
+    """
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        raise InputError(
+            f"{where}: qx,qy,qz,qw has length {length:.4f}, not a rotation; write a unit quaternion, w last"
+        )
+    return length
 
 
 def _require_commas(file: Path, header: str) -> None:
@@ -59,16 +82,17 @@ def _require_commas(file: Path, header: str) -> None:
     if separator is None or "," in header:
         return
     cell = rf"(?:^|[{separator}\n])\s*[+-]?\d+,\d+\s*(?=$|[{separator}\r\n])"
-    decimal = re.search(cell, file.read_text(encoding="utf-8", errors="replace")) is not None
-    mend = f"save it with commas between the cells{' and decimal points' * decimal}"
+    mend = "save it with commas between the cells"
+    found = f"is separated by {_SEPARATORS[separator]}"
+    if re.search(cell, file.read_text(encoding="utf-8", errors="replace")):
+        mend += " and decimal points"
+        found += ", with decimal commas"
     if file.name == "views.csv":
         folder = shlex.quote(str(file.parent))
         mend += (
             f", or let `stitch init {folder} --poses {shlex.quote(str(file))} -o OTHER` make a session of it as it is"
         )
-    raise InputError(
-        f"{file} line 1: is separated by {_SEPARATORS[separator]}{', with decimal commas' * decimal}; to fix: {mend}"
-    )
+    raise InputError(f"{file} line 1: {found}; to fix: {mend}")
 
 
 def _require_cells(file: Path, line: int, row: list[str], header: list[str]) -> None:

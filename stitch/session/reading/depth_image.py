@@ -99,8 +99,10 @@ def _exr(path: Path) -> Array:
         return np.dstack([channels[axis] for axis in "XYZ"])
     name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))
     pixels = channels[name]
-    is_colour = pixels.ndim == 3 and np.ptp(pixels[..., :3], axis=2).any()
-    return pixels[..., :3] if is_colour else pixels if pixels.ndim == 2 else pixels[..., 0]
+    if pixels.ndim == 2:
+        return pixels
+    is_colour = np.ptp(pixels[..., :3], axis=2).any()
+    return pixels[..., :3] if is_colour else pixels[..., 0]
 
 
 def points_of_image(where: Path | str, image: Array, camera: Intrinsics) -> Array:
@@ -115,7 +117,9 @@ def points_of_image(where: Path | str, image: Array, camera: Intrinsics) -> Arra
     Raises:
         InputError: the intrinsics are those of another size of image.
     """
-    return _points_of_depths(where, image, camera) if camera.pitch is None else _points_of_heights(image, camera.pitch)
+    if camera.pitch is not None:
+        return _points_of_heights(image, camera.pitch)
+    return _points_of_depths(where, image, camera)
 
 
 def _points_of_heights(heights: Array, pitch: tuple[float, float, float]) -> Array:

@@ -44,15 +44,15 @@ def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
     if points is None:
         return None
     if grey is None:
-        beside = _find_picture(path)
-        if beside is None:
+        picture = _find_picture(path)
+        if picture is None:
             return None
-        grey = _read_picture(beside)
+        grey = _read_picture(picture)
         if grey.shape != points.shape[:2]:
             sizes = [f"{shape[1]}×{shape[0]}" for shape in (grey.shape, points.shape)]
             raise InputError(
-                f"{beside}: {sizes[0]} pixels, its scan {path.name} has {sizes[1]}; to fix: export the picture aligned "
-                "to the depth"
+                f"{picture}: {sizes[0]} pixels, its scan {path.name} has {sizes[1]}; to fix: export the picture "
+                "aligned to the depth"
             )
     measured = np.isfinite(points).all(axis=2) & points.any(axis=2)
     points = np.where(np.expand_dims(measured, 2), points, np.nan)

@@ -352,8 +352,8 @@ def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) ->
         if joint.get("type") in _MOVING:
             turn = _turn_to_z(joint)
             q = next(values)
-            slides = joint.get("type") == "prismatic"
-            T = T @ turn @ (elementary("z", 0.0, 1e3 * q) if slides else elementary("z", q)) @ frames.inverse(turn)
+            motion = elementary("z", 0.0, 1e3 * q) if joint.get("type") == "prismatic" else elementary("z", q)
+            T = T @ turn @ motion @ frames.inverse(turn)
     return T
 
 
@@ -367,7 +367,7 @@ def _link_meshes(
     Args:
         chain: joints from base to flange, fixed ones among them.
         folder: of the URDF; names begin there, those of a package wherever above it the rest of the name fits.
-        scale: length_unit in a metre.
+        scale: length_unit per metre.
         T_flange_last: (4, 4) frame of the last turning joint's link in that of the flange.
     """
     turning = [joint for joint in chain if joint.get("type") != "fixed"]

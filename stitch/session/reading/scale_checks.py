@@ -46,15 +46,16 @@ def check_scale(session: SessionData, cloud_unit: str) -> None:
     clouds = {view.name: view.cloud.points for view in session.views if view.cloud is not None}
     distances = {name: metres * _median_distance(points) for name, points in clouds.items()}
     extents = {name: metres * _trimmed_extent(points) for name, points in clouds.items()}
-    for sizes, limits, does in ((distances, _RANGE_M, "lie {} away"), (extents, _SIZE_M, "extend over {}")):
-        _require_one_unit(toml, sizes, limits, does, cloud_unit)
+    for sizes, limits, predicate in ((distances, _RANGE_M, "lie {} away"), (extents, _SIZE_M, "extend over {}")):
+        _require_one_unit(toml, sizes, limits, predicate, cloud_unit)
         for name, size in sizes.items():
-            _require_plausible(size, limits, f"{toml}: the points of view {name}", does, "cloud_unit", cloud_unit)
+            subject = f"{toml}: the points of view {name}"
+            _require_plausible(size, limits, subject, predicate, "cloud_unit", cloud_unit)
     for view in session.views:
         if view.sighting is not None:
             distance = _median_distance(view.sighting.points) * metres
-            what = f"{toml}: the targets of view {view.name}"
-            _require_plausible(distance, _SIGHT_M, what, "lie {} away", "length_unit", session.length_unit)
+            subject = f"{toml}: the targets of view {view.name}"
+            _require_plausible(distance, _SIGHT_M, subject, "lie {} away", "length_unit", session.length_unit)
     flange = np.array([view.T_base_flange[:3, 3] for view in session.views]) * metres
     reach = float(np.linalg.norm(flange, axis=1).max())
     _require_plausible(
@@ -82,14 +83,14 @@ def require_near(where: str, points: Array) -> None:
         )
 
 
-def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, does: str, cloud_unit: str) -> None:
+def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, predicate: str, cloud_unit: str) -> None:
     """Refuse a few clouds whose size only makes sense in another unit, where most others have a plausible one.
 
     Args:
         toml: session.toml, for the message.
         sizes: view -> size of its cloud, m.
         limits: lowest and highest plausible size, m.
-        does: words for the message with {} for the size, as "extend over {}".
+        predicate: words for the message with {} for the size, as "extend over {}".
         cloud_unit: of the files.
 
     Raises:
@@ -99,25 +100,26 @@ def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, do
     others = [size for name, size in sizes.items() if name not in odd]
     if not odd or len(odd) > len(others):
         return
-    names = ", ".join([*odd][:_LISTED_CLOUDS]) + " …" * (len(odd) > _LISTED_CLOUDS)
+    names = ", ".join([*odd][:_LISTED_CLOUDS]) + (" …" if len(odd) > _LISTED_CLOUDS else "")
     size = _length_text(float(np.median([*odd.values()])))
     usual = _length_text(float(np.median(others)))
-    one = len(odd) == 1
+    one = "view", "that cloud alone is", "it"
+    view, clouds_are, them = one if len(odd) == 1 else ("views", "those clouds are", "them")
     raise ScaleError(
-        f"{toml}: the points of view{'' if one else 's'} {names} {does.format(size)}, those of the others (usually) "
-        f'{usual}, with cloud_unit = "{cloud_unit}": {"that cloud alone is" if one else "those clouds are"} in another '
-        f"unit than the others; to fix: export {'it' if one else 'them'} again in {cloud_unit}",
+        f"{toml}: the points of {view} {names} {predicate.format(size)}, those of the others (usually) {usual}, with "
+        f'cloud_unit = "{cloud_unit}": {clouds_are} in another unit than the others; to fix: export {them} again in '
+        f"{cloud_unit}",
         tuple(odd),
     )
 
 
-def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key: str, unit: str) -> None:
+def _require_plausible(size_m: float, limits: Limits, subject: str, predicate: str, key: str, unit: str) -> None:
     """Refuse a size that is not plausible.
 
     Args:
         size_m: m.
         limits: lowest and highest plausible size, m.
-        what, does: subject and predicate of the message, the latter with {} for the size, as "extend over {}".
+        subject, predicate: of the message, the latter with {} for the size, as "extend over {}".
         key, unit: the key of session.toml that may be wrong, and what it says now.
 
     Raises:
@@ -125,9 +127,12 @@ def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key:
     """
     if not _is_plausible(size_m, limits):
         factors = {other: CLOUD_METRES[other] / CLOUD_METRES[unit] for other in METRES if other != unit}
-        other, factor = (max if size_m < limits[0] else min)(factors.items(), key=lambda item: item[1])
-        hint = f'the scale looks off by {max(factor, 1 / factor):.4g}: set {key} = "{other}"'
-        raise ScaleError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
+        # What seems too small is in the largest other unit, what seems too large in the smallest.
+        choose = max if size_m < limits[0] else min
+        other = choose(factors, key=lambda name: factors[name])
+        times = max(factors[other], 1 / factors[other])
+        hint = f'the scale looks off by {times:.4g}: set {key} = "{other}"'
+        raise ScaleError(f'{subject} {predicate.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
 
 
 def _is_plausible(size_m: float, limits: Limits) -> bool:

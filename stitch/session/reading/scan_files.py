@@ -103,17 +103,25 @@ def read_text_columns(path: Path) -> dict[str, Array]:
         filled = [line.replace(",", ".") for line in filled]
         lines = [line.replace(",", ".") for line in lines]
     separator = next((s for s in ",;" if s in lines[0]), None)
-    first = _column_names(lines[0], separator)
-    header = any(not is_number(cell) for cell in first)
-    # Comments before the first line, but for a count of points.
-    above = [line for line in filled[: filled.index(lines[0])] if not line.strip().isdigit()]
-    names = first if header or not above else _column_names(above[-1].lstrip(" #/"), separator)
-    if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
-        names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
-    if len(lines) == header:
+    names = _column_names(lines[0], separator)
+    rows = lines
+    if all(is_number(cell) for cell in names):
+        comments = [line for line in filled[: filled.index(lines[0])] if not line.strip().isdigit()]
+        names = _names_without_header(comments, len(names), separator)
+    else:
+        rows = lines[1:]
+    if not rows:
         return {name: np.empty(0) for name in names}
-    table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
+    table = np.loadtxt(rows, delimiter=separator, ndmin=2).reshape(-1, len(names))
     return dict(zip(names, table.T, strict=True))
+
+
+def _names_without_header(comments: list[str], count: int, separator: str | None) -> list[str]:
+    """Return the names of so many columns: those in the last comment, if it names x, y, z; else x, y, z, scalar_0 …"""
+    names = _column_names(comments[-1].lstrip(" #/"), separator) if comments else []
+    if len(names) == count and {*"xyz"} <= {*names}:
+        return names
+    return [*"xyz", *(f"scalar_{i}" for i in range(count - 3))][:count]
 
 
 # Sections of surfaces in a CSV of Gocator: attributes in two lines, then names above the rows.
@@ -123,8 +131,7 @@ _SURFACES, _POINTS = ("Part", "Surface"), "SurfacePointCloud"
 def _columns_of_gocator(path: Path, lines: list[str]) -> dict[str, Array]:
     """Return x, y, z (N,) of the first surface in a CSV of Gocator, empty pixels left out.
 
-    A point cloud has x, y, z of each pixel side by side. A surface has heights z: x is in the header above the column,
-    y in the row's own cell.
+    A point cloud has x, y, z of each pixel side by side.
 
     Args:
         lines: of the file, comments and empty ones left out.
@@ -140,14 +147,21 @@ def _columns_of_gocator(path: Path, lines: list[str]) -> dict[str, Array]:
     if lines[begins[0]].startswith(_POINTS):
         numbers = np.array([float(cell or "nan") for row in rows for cell in row if is_number(cell or "nan")])
         return measured_pixels(dict(zip("xyz", numbers[: len(numbers) // 3 * 3].reshape(-1, 3).T, strict=True)))
+    return measured_pixels(_columns_of_heights(head, rows))
+
+
+def _columns_of_heights(head: list[str], rows: list[list[str]]) -> dict[str, Array]:
+    """Return x, y, z (N,) of the pixels of a surface of Gocator, all NaN where nothing was measured.
+
+    Cells hold heights z. x is the heading of the column, y stands in the row's own column Y, else in its first cell.
+    """
     across = [i for i, name in enumerate(head) if is_number(name)]
-    kept = [row for row in rows if "I" not in row[: across[0]]]  # brightness has rows of its own
-    z = np.array([[float(row[i] or "nan") for i in across] for row in kept])
-    y = np.array([float(row[head.index("Y") if "Y" in head else 0]) for row in kept])
-    grid = np.broadcast_arrays(np.array([float(head[i]) for i in across]), y[:, None], z)
-    return measured_pixels(
-        {axis: np.where(np.isnan(z), np.nan, c).ravel() for axis, c in zip("xyz", grid, strict=True)}
-    )
+    heights = [row for row in rows if "I" not in row[: across[0]]]  # brightness has rows of its own
+    z = np.array([[float(row[i] or "nan") for i in across] for row in heights])
+    y = np.array([float(row[head.index("Y") if "Y" in head else 0]) for row in heights])
+    x = np.array([float(head[i]) for i in across])
+    grid = np.broadcast_arrays(x, y[:, None], z)
+    return {axis: np.where(np.isnan(z), np.nan, c).ravel() for axis, c in zip("xyz", grid, strict=True)}
 
 
 def _column_names(line: str, separator: str | None) -> list[str]:
@@ -213,7 +227,8 @@ def read_left_handed(path: Path) -> dict[str, Array]:
     """
     lines = path.read_text(encoding="utf-8").splitlines()
     first = lines[0].split()
-    table = np.loadtxt(lines[len(first) < 3 or "x" in first :], ndmin=2)
+    has_header = len(first) < 3 or "x" in first
+    table = np.loadtxt(lines[1:] if has_header else lines, ndmin=2)
     return dict(zip("xyz", table[:, :3].T * [[1], [1], [-1]], strict=True))
 
 

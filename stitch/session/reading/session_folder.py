@@ -19,7 +19,7 @@ from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.axis_poses import place_stated_axes, require_placed
 from stitch.session.moving_scanner import deskew_session
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.csv_files import read_csv_lines
+from stitch.session.reading.csv_files import read_csv_rows
 from stitch.session.reading.scale_checks import check_scale, require_near
 from stitch.session.reading.session_toml import (
     cad_file,
@@ -76,7 +76,7 @@ def load_session(
     mount = table_choice(file, document, "mount", get_args(Mount))
     robot = read_robot(file, document.get("robot"), unit)
     tables = document.get("axis", [])
-    has_poses = not tables or has_pose_columns(read_csv_lines(path / "views.csv")[0])
+    has_poses = not tables or has_pose_columns(read_csv_rows(path / "views.csv")[0])
     axes = read_axes(file, tables, mount, has_poses)
     rows = read_views(path / "views.csv", robot, axes, unit) if start is None else [row_at(file, robot, start)]
     rows = [row for row in rows if only is None or row.view.name == only]
@@ -91,7 +91,7 @@ def load_session(
     if scans:
         sightings = _read_sightings(path, {view.name for view in views})
         clouds = read_scans(path, rows, unit, cloud_unit, scanner, within=within, at_most=at_most)
-        views = [_with_seen(path, row, cloud, sightings) for row, cloud in zip(rows, clouds, strict=True)]
+        views = [_measured_view(path, row, cloud, sightings) for row, cloud in zip(rows, clouds, strict=True)]
     cad, cad_unit = cad_file(file, document.get("part", {}))
     session = SessionData(
         path=path,
@@ -139,7 +139,7 @@ def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:
     return read_frames(frames, known) if frames.is_file() else {}
 
 
-def _with_seen(path: Path, row: ViewRow, cloud: Cloud | None, sightings: Mapping[str, Sighting]) -> View:
+def _measured_view(path: Path, row: ViewRow, cloud: Cloud | None, sightings: Mapping[str, Sighting]) -> View:
     """Return the view of a row with its cloud and its labelled points.
 
     Args:

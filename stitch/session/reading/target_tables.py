@@ -7,13 +7,12 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics import frames
-from stitch.session.reading.csv_files import finite_number, read_csv_lines
+from stitch.session.reading.csv_files import finite_number, read_csv_rows, require_unit_quaternion
 from stitch.session.reading.text_files import require_file, require_name, shortened
 from stitch.session.session import NominalTargets, Sighting
 
 _XYZ = ("x", "y", "z")
 _POSE = (*_XYZ, "qx", "qy", "qz", "qw")
-_QUATERNION_TOLERANCE = 1e-3
 # What the one target of a view of frames.csv is called.
 _PROBE = "probe"
 
@@ -94,12 +93,7 @@ def read_frames(file: Path, known: Collection[str]) -> dict[str, Sighting]:
         _require_view(file, line, name, known)
         lines[name] = line
         pose = np.array([finite_number(file, line, column, row[column]) for column in _POSE])
-        norm = float(np.linalg.norm(pose[3:]))
-        if abs(norm - 1) > _QUATERNION_TOLERANCE:
-            raise InputError(
-                f"{file} line {line}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
-                "write a unit quaternion, w last"
-            )
+        require_unit_quaternion(f"{file} line {line}", pose[3:])
         T = frames.from_quaternion(pose[:3], pose[3:])
         sigma = _column_sigma(file, line, row, "sigma")
         sigma_rotation = float(np.radians(_column_sigma(file, line, row, "sigma_deg")))
@@ -117,13 +111,13 @@ def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[tuple[int
     Raises:
         InputError: a column is missing, there is no row, or the file cannot be read.
     """
-    header, rows = read_csv_lines(file)
+    header, rows = read_csv_rows(file)
     missing = [name for name in needed if name not in header]
     if missing:
         raise InputError(f"{file} line 1: no column {missing[0]!r}; columns are {', '.join(header) or 'none'}")
     if not rows:
         raise InputError(empty)
-    return [(line, dict(zip(header, (cell.strip() for cell in cells), strict=True))) for line, cells in rows]
+    return rows
 
 
 def _target_rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:

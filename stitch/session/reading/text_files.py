@@ -82,20 +82,18 @@ def _require_size(file: Path, hint: str, largest_mb: float) -> None:
 
 
 @contextmanager
-def readable(place: Path | None = None) -> Iterator[None]:
-    """Turn a PermissionError in the block into an InputError with one clear line.
-
-    Args:
-        place: what is read, for an error that names no file.
+def readable() -> Iterator[None]:
+    """Turn a PermissionError in the block, or in the function that this decorates, into an InputError.
 
     Raises:
-        InputError: names it, and how to fix it.
+        InputError: names the file, and how to fix it.
     """
     try:
         yield
     except PermissionError as error:
-        name = error.filename or place or "a file"
-        raise InputError(f"{name}: may not be read; to fix: change its rights, or name another") from None
+        raise InputError(
+            f"{error.filename or 'a file'}: may not be read; to fix: change its rights, or name another"
+        ) from None
 
 
 @readable()
@@ -119,20 +117,24 @@ def require_file(file: Path, hint: str) -> None:
         raise InputError(f"{file}: is a pipe or a device; to fix: put a file there")
     if file.is_symlink():
         raise InputError(f"{file}: is a link to {file.readlink()}, which does not exist; to fix: {hint}")
-    raise InputError(_reason_missing(file) or f"{file}: not found; {hint}")
+    raise InputError(_run_not_session(file) or _damaged_run(file) or f"{file}: not found; {hint}")
 
 
-def _reason_missing(file: Path) -> str | None:
-    """Return a message for a missing file whose folder shows what was confused; None where "not found" says enough.
-
-    A run's folder was named in place of a session's, or a file of a run is missing.
-    """
+def _run_not_session(file: Path) -> str | None:
+    """Return the message for a missing session.toml in the folder of a run; None for any other missing file."""
     folder = file.parent
-    if file.name == _SESSION and _is_run(folder):
-        # The session of a run, or those of a rig.
-        results = (folder / "result.json", *sorted(folder.glob("*/result.json")))
-        sessions = ", ".join(dict.fromkeys(session for file in results if (session := _session_of_result(file))))
-        return f"{folder}: is a run{f' of {sessions}' * bool(sessions)}, not a session; to fix: name the session"
+    if file.name != _SESSION or not _is_run(folder):
+        return None
+    # The session of a run, or those of a rig.
+    results = (folder / "result.json", *sorted(folder.glob("*/result.json")))
+    sessions = [session for result in results if (session := _session_of_result(result))]
+    of = f" of {', '.join(dict.fromkeys(sessions))}" if sessions else ""
+    return f"{folder}: is a run{of}, not a session; to fix: name the session"
+
+
+def _damaged_run(file: Path) -> str | None:
+    """Return the message for a missing file that every run has, in the folder of one; None for any other file."""
+    folder = file.parent
     if file.name not in _DOCUMENTS or (folder / _SESSION).exists() or not _is_run(folder):
         return None
     # The folder of a rig has a model for all its runs, and no result of its own.
@@ -212,7 +214,8 @@ def optional_text(file: Path, table: dict[str, Any], name: str, key: str) -> str
     """
     value = table.get(key)
     if value is not None and not isinstance(value, str):
-        raise InputError(f"{file}: {f'{name}.' * bool(name)}{key} is {shortened(value)}; write a name in quotes")
+        place = f"{name}.{key}" if name else key
+        raise InputError(f"{file}: {place} is {shortened(value)}; write a name in quotes")
     return value
 
 

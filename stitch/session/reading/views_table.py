@@ -16,7 +16,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.axes import Axis
-from stitch.session.reading.csv_files import finite_number, is_number, read_csv_lines
+from stitch.session.reading.csv_files import finite_number, is_number, read_csv_rows, require_unit_quaternion
 from stitch.session.reading.text_files import require_file, require_name
 from stitch.session.robot import Robot, forward
 from stitch.session.session import View
@@ -31,8 +31,6 @@ _TORQUE = re.compile(r"j([1-9]\d*)_torque_nm$")
 _LARGEST_KG = 1e5
 _LARGEST_NM = 1e6
 _LISTED_COLUMNS = 4
-# A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
-_FLANGE_QUATERNION_TOLERANCE = 1e-3
 # Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
 # degrees and percents of the reach are another convention.
 _ANGLE_TOLERANCE = np.radians(2.0)
@@ -64,51 +62,77 @@ def read_views(file: Path, robot: Robot | None, axes: Sequence[Axis] = (), lengt
         InputError: names the line and how to fix it.
     """
     require_file(file, "a session needs a row per scan there")
-    header, lines = read_csv_lines(file)
+    header, cells = read_csv_rows(file)
     columns = [_axis_column(file, header, axis, length_unit) for axis in axes]
     joint_count = _check_header(file, header, robot, has_axes=bool(axes))
-    if not lines:
+    if not cells:
         raise InputError(f"{file}: no views; write one row per scan")
-    cells = [(line, {name: cell.strip() for name, cell in zip(header, row, strict=True)}) for line, row in lines]
     covariates = covariate_names(header, cells)
     joints = [_row_joints(file, line, row, joint_count) for line, row in cells]
     for line, row in cells:
         for column in columns:
             finite_number(file, line, column, row[column], "write the axis' reading in every row")
     require_loads(file, header, cells, joint_count)
+    _require_own_names(file, cells)
+    times = _row_times(file, cells)
+    has_poses = has_pose_columns(header) or not axes
     rows: list[ViewRow] = []
-    names: dict[str, int] = {}
-    latest = -np.inf
     for i, (line, row) in enumerate(cells):
-        name = row["view"]
-        if not name or name in names:
-            mend = f"is used on line {names[name]} already" if name else "is empty"
-            raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
-        names[require_name(f"{file} line {line}", name, "view")] = line
-        time_s = finite_number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
-        if time_s is not None and time_s < latest:
-            # Direction of approach, settling and drifts count on the order.
-            raise InputError(
-                f"{file} line {line}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go "
-                "on counting"
-            )
-        latest = latest if time_s is None else time_s
         view = View(
-            name=name,
+            name=row["view"],
             cloud=None,
             covariates={column: finite_number(file, line, column, row[column]) for column in covariates if row[column]},
-            T_base_flange=(
-                _flange_pose(file, line, name, row, joints[i], robot)
-                if has_pose_columns(header) or not axes
-                else np.eye(4)
-            ),
+            T_base_flange=_flange_pose(file, line, row, joints[i], robot) if has_poses else np.eye(4),
             joints=joints[i],
             approach=_row_approach(file, line, row, joints[i], joints[i - 1] if i else None),
-            time_s=time_s,
+            time_s=times[i],
         )
         rows.append(ViewRow(line, row.get("cloud", ""), view))
     _require_no_hidden_joints(file, cells, [row.view.T_base_flange for row in rows], robot)
     return rows
+
+
+def _require_own_names(file: Path, cells: Sequence[tuple[int, dict[str, str]]]) -> None:
+    """Refuse views whose name is empty, that of another view, or cannot be printed.
+
+    Args:
+        cells: of every row its line number and column -> cell.
+
+    Raises:
+        InputError: names the line.
+    """
+    lines: dict[str, int] = {}
+    for line, row in cells:
+        name = row["view"]
+        if not name or name in lines:
+            wrong = f"is used on line {lines[name]} already" if name else "is empty"
+            raise InputError(f"{file} line {line}: view {name!r} {wrong}; every view needs an id of its own")
+        lines[require_name(f"{file} line {line}", name, "view")] = line
+
+
+def _row_times(file: Path, cells: Sequence[tuple[int, dict[str, str]]]) -> list[float | None]:
+    """Return the time of each row, s; None where the row states none.
+
+    Args:
+        cells: of every row its line number and column -> cell.
+
+    Raises:
+        InputError: a time before that of an earlier row: approach, settling and drifts count on the order.
+    """
+    times: list[float | None] = []
+    latest = -np.inf
+    for line, row in cells:
+        time_s = finite_number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+        times.append(time_s)
+        if time_s is None:
+            continue
+        if time_s < latest:
+            raise InputError(
+                f"{file} line {line}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go "
+                "on counting"
+            )
+        latest = time_s
+    return times
 
 
 def has_pose_columns(header: Sequence[str]) -> bool:
@@ -158,9 +182,8 @@ def has_reported_poses(file: Path) -> bool:
     """
     if not file.is_file():
         return False
-    header, rows = read_csv_lines(file)
-    columns = [k for k, name in enumerate(header) if name in POSE_COLUMNS]
-    return any(cells[k].strip() for _, cells in rows for k in columns)
+    header, rows = read_csv_rows(file)
+    return any(row[name] for _, row in rows for name in POSE_COLUMNS if name in header)
 
 
 def _check_header(file: Path, header: Sequence[str], robot: Robot | None, has_axes: bool = False) -> int:
@@ -308,42 +331,32 @@ def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, 
                 raise InputError(f"{file} line {line}: {name} is {value:g}, as on no arm; to fix: correct its unit")
 
 
-def _flange_pose(
-    file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None
-) -> Array:
+def _flange_pose(file: Path, line: int, row: dict[str, str], joints: Array | None, robot: Robot | None) -> Array:
     """Return T_base_flange (4, 4) of a row, length_unit: the reported pose, else the one computed from the joints.
 
     Args:
-        name: of the view, for messages.
         row: column -> cell.
         joints: (n,) rad; None: the row has none.
 
     Raises:
-        InputError: the row has neither, the pose is none, or it disagrees with the joints.
+        InputError: the row has neither, its quaternion is not of unit length, or the pose disagrees with the joints.
     """
+    where = f"{file} line {line}: view {row['view']}"
     from_joints = forward(robot, joints) if robot and joints is not None else None
     given = [row.get(column, "") for column in POSE_COLUMNS]
     if not any(given):
         if from_joints is None:
-            raise InputError(
-                f"{file} line {line}: view {name} has no pose; fill {','.join(POSE_COLUMNS)} or the joints, or "
-                "remove the row"
-            )
+            raise InputError(f"{where} has no pose; fill {','.join(POSE_COLUMNS)} or the joints, or remove the row")
         return from_joints
     values = np.array([finite_number(file, line, c, cell) for c, cell in zip(POSE_COLUMNS, given, strict=True)])
-    norm = float(np.linalg.norm(values[3:]))
-    if abs(norm - 1) > _FLANGE_QUATERNION_TOLERANCE:
-        raise InputError(
-            f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
-            "write a unit quaternion, w last"
-        )
+    norm = require_unit_quaternion(where, values[3:])
     reported = frames.from_quaternion(values[:3], values[3:] / norm)
     if robot is not None and from_joints is not None:
-        require_agreement(f"{file} line {line}: view {name}", reported, from_joints, robot.metres_per_unit)
+        require_same_pose(where, reported, from_joints, robot.metres_per_unit)
     return reported
 
 
-def require_agreement(where: str, reported: Array, from_joints: Array, metres: float) -> None:
+def require_same_pose(where: str, reported: Array, from_joints: Array, metres_per_unit: float) -> None:
     """Refuse a reported pose that differs from the one computed from the joints by more than the tolerances.
 
     `_ANGLE_TOLERANCE`, and `_REACH_TOLERANCE` of the reach: more is another convention, not an uncalibrated arm.
@@ -351,15 +364,15 @@ def require_agreement(where: str, reported: Array, from_joints: Array, metres: f
     Args:
         where: row and view, for messages.
         reported, from_joints: (4, 4) T_base_flange, length_unit.
-        metres: metres per length_unit.
+        metres_per_unit: of lengths.
 
     Raises:
         InputError: by how much they differ, in mm and °, and what to check.
     """
-    angle, distance, reach = _disagreement(reported, from_joints)
-    if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
+    angle, distance, agree = _compare_poses(reported, from_joints)
+    if not agree:
         raise InputError(
-            f"{where}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
+            f"{where}: joints and reported pose differ by {1e3 * metres_per_unit * distance:.4g} mm and "
             f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
         )
 
@@ -403,22 +416,16 @@ def _otherwise_named_joints(header: Sequence[str]) -> list[str]:
 
 
 def _reaches_pose(robot: Robot, joints: Array, T: Array) -> bool:
-    """Return True if joint angles (n,) rad lead to T_base_flange T (4, 4), within `require_agreement`'s tolerances."""
-    if not np.isfinite(joints).all():
-        return False
-    from_joints = forward(robot, joints)
-    angle, distance, reach = _disagreement(T, from_joints)
-    return angle <= _ANGLE_TOLERANCE and distance <= _REACH_TOLERANCE * reach
+    """Return True if joint angles (n,) rad lead to T_base_flange T (4, 4), within `require_same_pose`'s tolerances."""
+    return bool(np.isfinite(joints).all()) and _compare_poses(T, forward(robot, joints))[2]
 
 
-def _disagreement(reported: Array, from_joints: Array) -> tuple[float, float, float]:
-    """Return angle, rad, and distance, length_unit, between two poses T_base_flange (4, 4), and the second's reach.
+def _compare_poses(reported: Array, from_joints: Array) -> tuple[float, float, bool]:
+    """Return angle, rad, and distance, length_unit, between two poses T_base_flange (4, 4), and whether they agree.
 
-    The reach is the flange's distance from the base, length_unit.
+    They do if both are within their tolerances; that of the distance counts in the flange's distance from the base.
     """
-    distance = np.linalg.norm(reported[:3, 3] - from_joints[:3, 3])
-    return (
-        float(frames.angle_between(reported, from_joints)),
-        float(distance),
-        float(np.linalg.norm(from_joints[:3, 3])),
-    )
+    angle = float(frames.angle_between(reported, from_joints))
+    distance = float(np.linalg.norm(reported[:3, 3] - from_joints[:3, 3]))
+    reach = float(np.linalg.norm(from_joints[:3, 3]))
+    return angle, distance, angle <= _ANGLE_TOLERANCE and distance <= _REACH_TOLERANCE * reach
