@@ -78,12 +78,12 @@ class Sightings:
             if len(seen) > count:
                 seen = seen[(view + np.arange(count) * len(seen) // count) % len(seen)]
             slots[view, : len(seen)] = seen
-        view = np.arange(len(slots))[:, None]
+        views = np.arange(len(slots))[:, None]
         is_filled = slots >= 0
-        target = np.where(is_filled, self.target[view, slots], -1)
-        points = np.where(is_filled[..., None], self.points[view, slots], 0.0)
-        used = self.used[view, slots] & is_filled
-        return replace(self, target=target, points=points, sigma=self.sigma[view, slots], used=used)
+        target = np.where(is_filled, self.target[views, slots], -1)
+        points = np.where(is_filled[..., None], self.points[views, slots], 0.0)
+        used = self.used[views, slots] & is_filled
+        return replace(self, target=target, points=points, sigma=self.sigma[views, slots], used=used)
 
     def without(self, left_out: Indices) -> "Sightings":
         """Return the sightings without the views at the indices `left_out`."""
