@@ -376,7 +376,7 @@ class _Conductor:
             until_screened: called before whole clouds are read to fuse them, see `_wait_until_screened`.
         """
         steps = pipeline_for(sessions[0])
-        finish = partial(steps.finish, seconds=seconds, method=self._register, until_screened=until_screened)
+        finish = partial(steps.register_session, seconds=seconds, method=self._register, until_screened=until_screened)
         every = enumerate(zip(sessions, self._coarse, memories, strict=True))
         return [finish(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
 

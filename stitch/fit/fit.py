@@ -7,6 +7,7 @@ left is fitted again.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -120,9 +121,10 @@ class Step(Generic[LinearisedT, SolutionT]):
 def iterate(
     linearise: Callable[[Step[LinearisedT, SolutionT] | None], LinearisedT], *, at_most: int, converged: float
 ) -> Iterator[Step[LinearisedT, SolutionT]]:
-    """Yield the steps of a fit: linearise, choose the parameters to fit, solve; the choice is fixed after two steps.
+    """Yield the steps of a fit, each: linearise, choose the parameters to fit, solve.
 
-    The last step is the first that moves no unknown by `converged` sigmas, or silently step `at_most`.
+    The choice is fixed after `_CHOICE_STEPS` steps. The last step is the first that moves no unknown by `converged`
+    sigmas, or step `at_most`; a fit that has not converged by then raises nothing.
 
     Args:
         linearise: returns the problem about the model after the step given; None: about the first model.
@@ -145,33 +147,55 @@ def iterate(
 def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], WhitenedData]) -> Mask:
     """Return a mask (P,) of the parameters that the views support and can tell apart; the others are to stay at zero.
 
-    Parameters that place axes (`Term.is_geometry`) are chosen first, by whether the views show them at all. Then the
-    groups of parameters of each effect are selected by their evidence (`select_supported`), with the axes free.
+    Parameters that place axes (`Term.is_geometry`) are chosen first: all that the views show. Those of effects are
+    chosen with these free (`_supported_parameters`), since the place of an axis is unknown like the hand-eye.
 
     Args:
         before: (P,) mask of the parameters fitted so far; none of another run's arm (`kept`) is among them.
         whitened: returns the observations whitened by the scatter that remains when the parameters of a mask are free.
     """
+    may_be_fitted = np.array([term.is_geometry and not p.held for term in terms for p in term.parameters], bool)
+    if not may_be_fitted.any():
+        return _supported_parameters(terms, before, whitened)
+    data = whitened(before | may_be_fitted)
+    fitted = may_be_fitted & independent(data.base, data.further * may_be_fitted, sizes_of(terms), 1 / UNSEEN)
+    effects = [term for term in terms if not term.is_geometry]
+    if effects:
+        of_effects = np.array([not term.is_geometry for term in terms for _ in term.parameters], bool)
+        beside_axes = partial(_effects_beside_axes, whitened, fitted.copy(), of_effects)
+        fitted[of_effects] = _supported_parameters(effects, before[of_effects], beside_axes)
+    return fitted
+
+
+def _effects_beside_axes(
+    whitened: Callable[[Mask], WhitenedData], axes: Mask, of_effects: Mask, free: Mask
+) -> WhitenedData:
+    """Return the whitened data with the columns of effects as `further`, those of the fitted axes in `base`.
+
+    Args:
+        whitened: returns the whitened data of all P parameters, as in `fitted_parameters`.
+        axes: (P,) mask of the parameters of axes that are fitted.
+        of_effects: (P,) mask of the E parameters of effects.
+        free: (E,) mask of the parameters of effects that are free while the scatter is estimated.
+    """
+    all_free = axes.copy()
+    all_free[of_effects] = free
+    data = whitened(all_free)
+    return WhitenedData(np.hstack([data.base, data.further[:, axes]]), data.further[:, of_effects], data.z)
+
+
+def _supported_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], WhitenedData]) -> Mask:
+    """Return a mask (P,) of parameters to fit: groups selected by evidence, less what cannot be told apart.
+
+    The selection (`select_supported`) is made again with what it fits free, at most `_CHOICE_STEPS` times: what is
+    fitted explains scatter, and less scatter shows more. Effects of another run's arm (`kept`) are not selected.
+
+    Args:
+        before: (P,) mask of the parameters fitted so far.
+        whitened: as in `fitted_parameters`.
+    """
     sizes = sizes_of(terms)
-    geometry = np.array([term.is_geometry and not p.held for term in terms for p in term.parameters], bool)
-    if geometry.any():
-        # The place of an axis is unknown like the hand-eye; effects are judged with it free.
-        data = whitened(before | geometry)
-        shown = geometry & independent(data.base, data.further * geometry, sizes, 1 / UNSEEN)
-        others = [term for term in terms if not term.is_geometry]
-        if not others:
-            return shown
-        there = np.array([not term.is_geometry for term in terms for _ in term.parameters], bool)
-
-        def beside(free: Mask) -> WhitenedData:
-            """Return the whitened data of the effects alone, with the axes shown among the base columns."""
-            whole = shown.copy()
-            whole[there] = free
-            seen = whitened(whole)
-            return WhitenedData(np.hstack([seen.base, seen.further[:, shown]]), seen.further[:, there], seen.z)
-
-        shown[there] = fitted_parameters(others, before[there], beside)
-        return shown
+    # Groups of parameters that can be true alone, and the number of the effect of each.
     groups, effects, first = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
         if not any(p.kept for p in term.parameters):
@@ -183,7 +207,6 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
         return before
     free, data = before, whitened(before)
     for _ in range(_CHOICE_STEPS):
-        # What is fitted explains scatter, and less scatter shows more.
         supported = select_supported(data, sizes, groups, effects)
         if (supported == free).all():
             break
@@ -196,9 +219,10 @@ def fit_without_outliers(
     fit: Callable[[Sequence[Measurement], FitResult | None], FitResult],
     targets_of: Callable[[Sequence[Measurement], FitResult], Sequence[TargetModelFit | None]],
 ) -> tuple[FitResult, list[FittedSession]]:
-    """Return the fit and the sessions without labelled points that contradict the rest: fitted again until none does.
+    """Return a fit and its sessions without outliers, labelled points that contradict the rest.
 
-    Views with mislabelled targets are taken out before the first fit, since they would pull it.
+    Fitting and removing outliers (`find_outliers`) alternate until none is found. Mislabelled targets are removed
+    before the first fit, since they would pull it.
 
     Args:
         fit: returns the fit of measurements; its second argument is the fit of the round before, None in the first.
@@ -207,19 +231,20 @@ def fit_without_outliers(
     Raises:
         NoResultError: more than a third of the labelled points of a session would have to go.
     """
-    every_point = [_with_sightings(m, s.with_outliers) if (s := m.capture.sightings) else m for m in measurements]
-    outliers = [[m.outlier for m in find_mislabelled(s)] if (s := e.capture.sightings) else [] for e in every_point]
-    measurements = [_remove_points(m, taken) for m, taken in zip(every_point, outliers, strict=True)]
+    # Outliers that an earlier fit has removed count again: they are sought anew.
+    all_points = [_with_sightings(m, s.with_outliers) if (s := m.capture.sightings) else m for m in measurements]
+    removed = [[m.outlier for m in find_mislabelled(s)] if (s := a.capture.sightings) else [] for a in all_points]
+    measurements = [_remove_points(m, outliers) for m, outliers in zip(all_points, removed, strict=True)]
     result: FitResult | None = None
     while True:
         result = fit(measurements, result)
         targets = targets_of(measurements, result)
-        further = [find_outliers(t.rows, t.variances) if t else [] for t in targets]
-        if not any(further):
-            sessions = zip(measurements, targets, outliers, strict=True)
-            return result, [FittedSession(m, t, tuple(taken)) for m, t, taken in sessions]
-        measurements = [_remove_points(m, more) for m, more in zip(measurements, further, strict=True)]
-        outliers = [[*taken, *more] for taken, more in zip(outliers, further, strict=True)]
+        found = [find_outliers(t.rows, t.variances) if t else [] for t in targets]
+        if not any(found):
+            sessions = zip(measurements, targets, removed, strict=True)
+            return result, [FittedSession(m, t, tuple(outliers)) for m, t, outliers in sessions]
+        measurements = [_remove_points(m, outliers) for m, outliers in zip(measurements, found, strict=True)]
+        removed = [[*before, *outliers] for before, outliers in zip(removed, found, strict=True)]
 
 
 def _remove_points(measurement: Measurement, outliers: Sequence[Outlier]) -> Measurement:
@@ -241,4 +266,5 @@ def _remove_points(measurement: Measurement, outliers: Sequence[Outlier]) -> Mea
 
 
 def _with_sightings(measurement: Measurement, sightings: Sightings) -> Measurement:
+    """Return the measurement with other labelled points."""
     return replace(measurement, capture=replace(measurement.capture, sightings=sightings))

@@ -35,14 +35,14 @@ class Pipeline(Protocol):
     def fit(
         self, sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
     ) -> FittedRig:
-        """Return the sessions with their common model."""
+        """Return the sessions of a rig with their common model, fitted from `start` on."""
         ...
 
     def linearise(self, session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-        """Return what was observed, as one linear model about a model."""
+        """Return what one session observed as a linear model about `model`; `gate` as in the function `linearise`."""
         ...
 
-    def finish(
+    def register_session(
         self,
         session: SessionData,
         fitted: FittedRig,
@@ -54,12 +54,13 @@ class Pipeline(Protocol):
         method: str,
         until_screened: Callable[[], None],
     ) -> tuple[Fit, float]:
-        """Return session `index` of a rig with its views registered and fused, and its noise floor, length_unit.
+        """Return the result of session `index`, its views registered and fused, and its noise floor, length_unit.
 
         It runs in a background thread while the views are screened; where the screening leaves views out, the recorder
         raises an exception that ends it.
 
         Args:
+            fitted: all sessions of the rig with their common model.
             coarse: result of the stage before the fit.
             seconds: time that the fit has taken.
             method: by which surfaces are registered: dpwvm, gicp or vmm.
@@ -68,12 +69,12 @@ class Pipeline(Protocol):
         ...
 
     def notes(self, session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
-        """Return what a user should know before trusting the result."""
+        """Return warnings and notes on session `index`: what a user should know before trusting the result."""
         ...
 
 
 def pipeline_for(session: SessionData) -> Pipeline:
-    """Return how a run goes with what was observed."""
+    """Return the steps of a run for what was observed: those from clouds, or from labelled points alone."""
     return surface_steps if session.has_clouds else target_steps
 
 

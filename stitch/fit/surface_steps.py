@@ -68,12 +68,12 @@ def fit(
     that the fit found.
 
     Args:
-        start: what the fit begins from, see `once`.
+        start: what the fit begins from, see `fit_once`.
         recorder: is shown every step of the first session.
     """
 
-    def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        """Fit all sessions once: by a given model, from a model, or by correction and then effects."""
+    def fit_once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
+        """Return the fit of all sessions: by a given model, from a model, or by correction and then effects."""
         if start.given is not None:
             model = bind_to_session(start.given, measurements[0])
             return apply_given_hand_eye([corrected_capture(m, model) for m in measurements], model)
@@ -88,7 +88,7 @@ def fit(
         model = start.effects(weighed[0], Model(correction.geometry.T_mount), gates[0])
         return fit_surfaces(weighed, model, gates, recorder)
 
-    correction, fitted = fit_without_outliers(measurements, once, _locate_targets)
+    correction, fitted = fit_without_outliers(measurements, fit_once, _locate_targets)
     weighed = _weighed([session.measurement for session in fitted], correction)
     return FittedRig([replace(s, measurement=m) for s, m in zip(fitted, weighed, strict=True)], correction)
 
@@ -98,6 +98,7 @@ def _correct_hand_eye(measurements: Sequence[Measurement], hand_eye: CoarseHandE
     captures = [measurement.capture for measurement in measurements]
 
     def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
+        """Return the prior of pose errors at a hand-eye (4, 4), about the centre of each session's overlaps."""
         return prior_pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in unconstrained])
 
     return correct(
@@ -112,7 +113,7 @@ def _correct_hand_eye(measurements: Sequence[Measurement], hand_eye: CoarseHandE
 
 
 def _weighed(measurements: Sequence[Measurement], correction: Correction) -> list[Measurement]:
-    """Measurements whose clouds weigh as the correction says (`Capture.noise_factor`)."""
+    """Return the measurements with the noise factor that the correction found: by it labelled points are weighted."""
     return [
         replace(m, capture=replace(m.capture, noise_factor=corrected.noise_factor))
         for m, corrected in zip(measurements, correction.captures, strict=True)
@@ -120,7 +121,7 @@ def _weighed(measurements: Sequence[Measurement], correction: Correction) -> lis
 
 
 def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
-    """Return per session where its targets lie under the corrected model; None where it has none."""
+    """Return per session the places of its labelled points under the corrected model; None where it has none."""
     # `correction.hand_eye` computes a covariance: only where targets need it.
     return [
         None if m.capture.sightings is None else locate_targets(m, correction.model, correction.hand_eye.inflation)
@@ -141,7 +142,7 @@ def linearise(session: SessionData, measurement: Measurement, model: Model, gate
     return surface_model(measurement, model, capture, unconstrained_poses(capture, capture.poses(model.T_mount), gate))
 
 
-def finish(
+def register_session(
     session: SessionData,
     fitted: FittedRig,
     index: int,
@@ -152,10 +153,12 @@ def finish(
     method: str,
     until_screened: Callable[[], None],
 ) -> tuple[Fit, float]:
-    """Return session `index` of a rig with its views registered and fused, and its noise floor, length_unit.
+    """Return the result of session `index` of a rig, its views registered and fused, and its noise floor, length_unit.
 
     Args:
+        fitted: all sessions of the rig with their common model.
         coarse: result of the stage before the fit.
+        recorder: is shown the stages correct, register and fuse.
         seconds: time that the fit has taken.
         method: by which surfaces are registered: dpwvm, gicp or vmm.
         until_screened: blocks until the screening has left all views in.
@@ -177,7 +180,8 @@ def finish(
     clock = Clock()
     fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
     several = int((fused.count > 1).sum())
-    last = StageResult("fuse", _fused_rms(fused.residual), several, 1, clock.lap(), support_note(unsupported))
+    note = support_note(unsupported)
+    last = StageResult("fuse", _fused_rms(fused.residual), several, iterations=1, seconds=clock.lap(), note=note)
     recorder.stage(last, registration.poses)
     floor = noise_floor(capture, registration.overlaps, session.scanner.noise)
     scatter = correction.scatter[index]

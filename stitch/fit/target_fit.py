@@ -25,8 +25,8 @@ from stitch.model.model import (
     with_parameter_values,
 )
 from stitch.numerics.folds import grouped_folds, view_clusters
-from stitch.numerics.frames import Array, Mask, exp
-from stitch.numerics.least_squares import BlockLeastSquares
+from stitch.numerics.frames import Array, Indices, Mask, exp
+from stitch.numerics.least_squares import BlockLeastSquares, grouped_inflation
 from stitch.numerics.parameter_selection import WhitenedData
 from stitch.numerics.reml import MixedModel, fit_variances, whitener
 from stitch.observations.targets.rows import (
@@ -43,7 +43,8 @@ from stitch.session.measurement import Measurement
 _MAXIMUM_STEPS = 12
 # A step that moves no unknown by so many sigmas is the last.
 _CONVERGED = 0.02
-_MIN_VIEWS_FOR_REML = 3  # numbers for each that is free
+# So many rows for each unknown, and variances can be estimated with all effects free.
+_MIN_NUMBERS_PER_UNKNOWN = 3
 
 
 def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list[TargetModelFit]:
@@ -60,58 +61,60 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
     def linearise(before: "TargetStep | None") -> LinearisedTargets:
         if before is None:
             return LinearisedTargets(list(sessions), None)
-        moved, _, _, variances = before.solution
-        return LinearisedTargets(moved, variances)
+        return LinearisedTargets(before.solution.sessions, before.solution.variances)
 
     history: list[float] = []
     for step in iterate(linearise, at_most=_MAXIMUM_STEPS, converged=_CONVERGED):
         poses = step.linearised.sessions[0].rows.capture.poses(step.model.T_mount)
         recorder.iteration("fit", len(history), poses, step.rms, float("nan"))
         history.append(step.rms)
-    linearised, terms = step.linearised, step.model.terms
-    moved, blocks, covariance, variances = step.solution
-    # Blocks of all sessions come one after the other: numbers of views become numbers of blocks.
-    groups = [
-        at.start + views
-        for session, at in zip(linearised.sessions, linearised.blocks_of, strict=True)
-        for views in view_clusters(session.rows.capture.T_base_flange, session.rows.reach)
+    equations = step.solution.equations
+    left_out = np.array([equations.solve(group) for group in step.linearised.jackknife_groups])
+    inflation = grouped_inflation(left_out, step.solution.covariance)
+    # Another run's arm errs alike in every view, which no inflation covers.
+    kept = kept_root(step.model.terms, sessions[0].model.effects_covariance)
+    shift = equations.shift_by_errors(step.linearised.columns @ kept)
+    covariance = step.solution.covariance * inflation + shift @ shift.T
+    return [
+        TargetModelFit(
+            model=final.model,
+            inflation=inflation,
+            landmarks=final.landmarks,
+            landmarks_covariance=covariance[unknowns, unknowns][6:, 6:],
+            variances=step.solution.variances,
+            rows=final.rows,
+            heldout=_heldout_distances(before.rows, equations, blocks),
+            history=(*history, _rms_of_sessions([final])),
+        )
+        for before, final, unknowns, blocks in zip(
+            step.linearised.sessions,
+            _with_covariances(step, covariance, kept),
+            step.linearised.unknowns_of,
+            step.linearised.blocks_of,
+            strict=True,
+        )
     ]
-    inflation = blocks.inflation(groups, covariance)
-    covariance = covariance * inflation
-    # `kept` is a root of the covariance of another run's arm, which errs alike in every view.
-    kept = kept_root(terms, sessions[0].model.effects_covariance)
-    shift = blocks.shift_by_errors(linearised.columns @ kept)
-    covariance = covariance + shift @ shift.T
-    of_effects = slice(linearised.base.shape[2], None)
-    sigmas = known_sigmas(terms, step.choice, np.sqrt(np.diag(covariance)[of_effects]))
-    terms = with_parameter_values(terms, values_of(terms), sigmas)
-    fits = []
-    for k, (before, after) in enumerate(zip(linearised.sessions, moved, strict=True)):
-        unknowns = linearised.unknowns_of[k]
-        of_session = covariance[unknowns, unknowns]
-        effects_covariance = covariance_of_fit(
-            terms,
-            step.choice,
-            covariance[of_effects, of_effects],
-            kept,
-            np.hstack([of_session[:6, :6], covariance[unknowns, of_effects][:6]]),
-        )
-        final = replace(
-            after, model=Model(after.model.T_mount, terms, of_session[:6, :6], effects_covariance=effects_covariance)
-        )
-        fits.append(
-            TargetModelFit(
-                model=final.model,
-                inflation=inflation,
-                landmarks=final.landmarks,
-                landmarks_covariance=of_session[6:, 6:],
-                variances=variances,
-                rows=final.rows,
-                heldout=_heldout_distances(before.rows, blocks, linearised.blocks_of[k]),
-                history=(*history, _rms_of_sessions([final])),
-            )
-        )
-    return fits
+
+
+def _with_covariances(step: "TargetStep", covariance: Array, kept: Array) -> "list[TargetSession]":
+    """Return the sessions after a step, their models with the covariances of hand-eye and effects.
+
+    Args:
+        covariance: of all unknowns: those of each session, the hand-eye's six first, then the F effects' parameters
+            that are fitted.
+        kept: (P, L) root of the covariance of the parameters of another run's arm.
+    """
+    of_effects = slice(step.linearised.base.shape[2], None)
+    sigmas = known_sigmas(step.model.terms, step.choice, np.sqrt(np.diag(covariance)[of_effects]))
+    terms = with_parameter_values(step.model.terms, values_of(step.model.terms), sigmas)
+    sessions = []
+    for session, unknowns in zip(step.solution.sessions, step.linearised.unknowns_of, strict=True):
+        hand_eye = covariance[unknowns, unknowns][:6, :6]
+        with_hand_eye = np.hstack([hand_eye, covariance[unknowns, of_effects][:6]])
+        effects = covariance_of_fit(terms, step.choice, covariance[of_effects, of_effects], kept, with_hand_eye)
+        model = Model(session.model.T_mount, terms, hand_eye, effects_covariance=effects)
+        sessions.append(replace(session, model=model))
+    return sessions
 
 
 @dataclass(frozen=True)
@@ -134,27 +137,33 @@ class TargetSession:
         return self.rows.columns_in_use(self.measurement, self.model)
 
     @property
-    def unknowns(self) -> int:
-        """Of the session alone."""
+    def unknown_count(self) -> int:
+        """Number of unknowns of the session alone: six of the hand-eye, then those of the landmarks."""
         return 6 + int(self.rows.landmarks.shape[2])
 
     def moved(self, x: Array, terms: tuple[Term, ...]) -> "TargetSession":
-        """Return the session after a step x (a,) of its own unknowns, with the effects as they are then."""
+        """Return the session with its own unknowns moved by x (`unknown_count`,), and with other effects `terms`."""
         model = Model(self.model.T_mount @ exp(x[:6]), terms)
         return TargetSession(self.measurement, model, self.landmarks.updated(x[6:]))
 
 
-# The sessions after a step, its normal equations, the covariance of all unknowns (those of each session, then the
-# effects), and the variances (3,) of scatter and noise.
-Solution = tuple[list[TargetSession], BlockLeastSquares, Array, Array]
+@dataclass(frozen=True)
+class TargetSolution:
+    """The solution of one linear step."""
+
+    sessions: list[TargetSession]  # after the step
+    equations: BlockLeastSquares  # normal equations of the step
+    # (U, U) of all unknowns: those of each session in turn, then the effects' parameters that are fitted.
+    covariance: Array
+    variances: Array  # (3,) of rotation scatter, translation scatter and the sensor's noise
 
 
 @dataclass(frozen=True)
 class LinearisedTargets:
-    """Rows of targets of all sessions about their models."""
+    """Rows of targets of all sessions about their models: B blocks of m rows, one per view or nominal target."""
 
     sessions: list[TargetSession]
-    start: Array | None  # (3,) variances of the step before
+    start: Array | None  # (3,) variances of the step before; None in the first
 
     @cached_property
     def base(self) -> Array:
@@ -163,21 +172,34 @@ class LinearisedTargets:
 
     @cached_property
     def columns(self) -> Array:
-        """(B, m, P) of the effects."""
+        """(B, m, P) columns of the effects' parameters."""
         return _stack_blocks([session.columns for session in self.sessions])
 
     @property
     def unknowns_of(self) -> list[slice]:
-        """Each session's own unknowns among all."""
-        return _consecutive([session.unknowns for session in self.sessions])
+        """Per session where its own unknowns stand among those of all sessions."""
+        return _consecutive([session.unknown_count for session in self.sessions])
 
     @property
     def blocks_of(self) -> list[slice]:
-        """Each session's blocks among all."""
+        """Per session where its blocks stand among those of all sessions."""
         return _consecutive([len(session.columns) for session in self.sessions])
 
+    @property
+    def jackknife_groups(self) -> list[Indices]:
+        """Clusters of views of each session, as numbers of blocks: groups that the jackknife leaves out in turn."""
+        return [
+            blocks.start + views
+            for session, blocks in zip(self.sessions, self.blocks_of, strict=True)
+            for views in view_clusters(session.rows.capture.T_base_flange, session.rows.reach)
+        ]
+
     def choose(self, before: Mask | None) -> Mask:
-        """Return (P,) the parameters that the views ask for, those of before first."""
+        """Return a mask (P,) of the parameters to fit: see `fitted_parameters`.
+
+        Args:
+            before: (P,) those fitted in the step before; None in the first.
+        """
         terms = self.sessions[0].model.terms
         before = np.zeros(self.columns.shape[2], bool) if before is None else before
         return fitted_parameters(terms, before, self._whitened)
@@ -193,12 +215,12 @@ class LinearisedTargets:
         held = np.array([p.held for p in stack_parameters(terms)], bool)
         # A parameter that goes to zero changes the residuals by its column: z is corrected for that.
         stays = held | choice
-        mixed = self._mixed(np.concatenate([self.base, self.columns[..., choice]], axis=2))
+        mixed = self._mixed_model(choice)
         mixed = replace(mixed, z=mixed.z + self.columns[..., ~stays] @ before[~stays])
         variances = fit_variances(mixed, start=self._starting_variances).variances
-        blocks = self._normal_equations(mixed, sizes[choice], before[choice], variances)
-        x = blocks.solve()
-        covariance = blocks.estimates_covariance()
+        equations = self._normal_equations(mixed, sizes[choice], before[choice], variances)
+        x = equations.solve()
+        covariance = equations.estimates_covariance()
         values = np.where(stays, before, 0.0)
         values[choice] += x[self.base.shape[2] :]
         terms = with_parameter_values(terms, values)
@@ -206,19 +228,24 @@ class LinearisedTargets:
         return Step(
             linearised=self,
             choice=choice,
-            solution=(moved, blocks, covariance, variances),
+            solution=TargetSolution(moved, equations, covariance, variances),
             model=moved[0].model,
             moved=float(np.max(np.abs(x) / np.sqrt(np.maximum(np.diag(covariance), 1e-300)))),
             rms=_rms_of_sessions(self.sessions),
         )
 
-    def _mixed(self, A: Array) -> MixedModel:
-        """Return the mixed model of the rows of all sessions, with columns A (B, m, a) of the free mean."""
-        mixed = [
-            session.rows.mixed_model(A[at, : session.rows.residual.shape[1]])
-            for session, at in zip(self.sessions, self.blocks_of, strict=True)
+    def _mixed_model(self, free: Mask) -> MixedModel:
+        """Return the mixed model of all sessions' rows; its free mean is hand-eyes, landmarks and some parameters.
+
+        Args:
+            free: (P,) mask of those parameters of the effects.
+        """
+        A = np.concatenate([self.base, self.columns[..., free]], axis=2)
+        of_sessions = [
+            session.rows.mixed_model(A[blocks, : session.rows.residual.shape[1]])
+            for session, blocks in zip(self.sessions, self.blocks_of, strict=True)
         ]
-        return _stack_mixed_models(mixed, A)
+        return _stack_mixed_models(of_sessions, A)
 
     @cached_property
     def _starting_variances(self) -> Array:
@@ -228,43 +255,51 @@ class LinearisedTargets:
         """
         if self.start is not None:
             return self.start
-        everything = np.concatenate([self.base, self.columns], axis=2)
-        enough = self._mixed(self.base).size > _MIN_VIEWS_FOR_REML * everything.shape[2]
-        return fit_variances(self._mixed(everything if enough else self.base), both_starts=True).variances
+        all_free = np.ones(self.columns.shape[2], bool)
+        without_effects = self._mixed_model(~all_free)
+        unknowns = self.base.shape[2] + self.columns.shape[2]
+        enough = without_effects.size > _MIN_NUMBERS_PER_UNKNOWN * unknowns
+        return fit_variances(self._mixed_model(all_free) if enough else without_effects, both_starts=True).variances
 
     def _whitened(self, free: Mask) -> WhitenedData:
         """Return columns of hand-eyes and landmarks, columns of effects, and observations, whitened.
 
-        The covariance is that with the `free` parameters (P,) of the effects fitted. The observations are those of a
-        model without effects: what the present values explain is added again.
+        The scatter is estimated with the `free` parameters fitted: effects that are left out would count as scatter.
+        All columns are whitened by the one covariance, so that parameters not fitted yet can be judged too. The
+        observations are those of a model without effects: what the present values explain is added again.
+
+        Args:
+            free: (P,) mask of parameters of the effects.
         """
-        mixed = self._mixed(self.base)
-        beside = self._mixed(np.concatenate([self.base, self.columns[..., free]], axis=2))
-        half = whitener(mixed, fit_variances(beside, start=self._starting_variances).variances)
+        mixed = self._mixed_model(free)
+        inverse_root = whitener(mixed, fit_variances(mixed, start=self._starting_variances).variances)
         z = (mixed.z + self.columns @ values_of(self.sessions[0].model.terms))[..., None]
-        n = mixed.z.size
-        base, further, seen = ((half @ c).reshape(n, c.shape[2]) for c in (self.base, self.columns, z))
-        return WhitenedData(base, further, seen[:, 0])
+        base, further, white_z = (
+            (inverse_root @ columns).reshape(mixed.z.size, columns.shape[2]) for columns in (self.base, self.columns, z)
+        )
+        return WhitenedData(base, further, white_z[:, 0])
 
     def _normal_equations(self, mixed: MixedModel, sizes: Array, values: Array, variances: Array) -> BlockLeastSquares:
         """Return the normal equations of a step from the present values; the prior of the effects is about zero.
 
         Args:
-            sizes: (P,) plausible sizes of the effects' parameters.
-            values: (P,) where these are now.
+            mixed: rows of all sessions; its free mean is hand-eyes, landmarks and the F parameters fitted.
+            sizes: (F,) plausible sizes of these parameters.
+            values: (F,) where these are now.
             variances: (3,) of rotation scatter, translation scatter and the sensor's noise.
         """
-        far = []
+        prior_sigmas = []
         for session in self.sessions:
             distance = float(np.median(np.linalg.norm(np.concatenate(session.rows.capture.point_sets), axis=1)))
             # A weak prior of 1 rad and one working distance keeps unseen unknowns finite and moves no others.
-            far += [1.0] * 3 + [distance] * (session.unknowns - 3)
-        precision = np.concatenate([far, WEAK * sizes]) ** -2.0
-        pull = np.concatenate([np.zeros(len(far)), -values * precision[len(far) :]])
-        return BlockLeastSquares(mixed.z, mixed.A, mixed.covariance(variances), precision, pull)
+            prior_sigmas += [1.0] * 3 + [distance] * (session.unknown_count - 3)
+        of_sessions = len(prior_sigmas)
+        precision = np.concatenate([prior_sigmas, WEAK * sizes]) ** -2.0
+        prior_vector = np.concatenate([np.zeros(of_sessions), -values * precision[of_sessions:]])
+        return BlockLeastSquares(mixed.z, mixed.A, mixed.covariance(variances), precision, prior_vector)
 
 
-TargetStep = Step[LinearisedTargets, Solution]
+TargetStep = Step[LinearisedTargets, TargetSolution]
 
 
 def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit | None:
@@ -331,24 +366,25 @@ def evaluate_targets(measurement: Measurement, model: Model) -> TargetModelFit:
 
 
 def _rms_of_sessions(sessions: Sequence[TargetSession]) -> float:
-    """3D distance of the targets from where they are, length_unit."""
+    """Return the rms 3D distance (length_unit) of all sightings of the sessions from their targets' fitted places."""
     return rms_of(np.concatenate([s.rows.distances(s.rows.residual).ravel() for s in sessions]))
 
 
-def _heldout_distances(rows: TargetRows, blocks: BlockLeastSquares, at: slice) -> Array:
+def _heldout_distances(rows: TargetRows, equations: BlockLeastSquares, blocks: slice) -> Array:
     """Return rms distances (V, S) of the targets, length_unit, in fits from which their views were left out.
 
     Views are left out in groups of neighbours in time or pose (`grouped_folds`); NaN where a target was not seen.
 
     Args:
-        blocks: normal equations of the last step, of all sessions.
-        at: the session's blocks among those of all.
+        rows: of one session.
+        equations: normal equations of the last step, of all sessions.
+        blocks: where the blocks of this session stand among those of all.
     """
     square, count = np.zeros((2, *rows.distances(rows.residual).shape))
     m = rows.residual.shape[1]
-    X, z = blocks.X[at, :m], blocks.z[at, :m]
+    X, z = equations.X[blocks, :m], equations.z[blocks, :m]
     for fold in grouped_folds(rows.capture.T_base_flange, rows.reach):
-        residual = X @ blocks.solve(at.start + fold) - z
+        residual = X @ equations.solve(blocks.start + fold) - z
         square[fold] += rows.distances(residual)[fold] ** 2
         count[fold] += 1
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -63,6 +63,7 @@ def _start_session(session: SessionData, measurement: Measurement, file: ModelFi
 
 
 def _sightings(measurement: Measurement) -> Sightings:
+    """Return the labelled points of a session that has some."""
     assert measurement.capture.sightings is not None
     return measurement.capture.sightings
 
@@ -79,6 +80,7 @@ def fit(
         file = start.given
 
         def evaluate(measurements: Sequence[Measurement], _: list[TargetModelFit] | None) -> list[TargetModelFit]:
+            """Return the labelled points of every session under the model of the other run."""
             return [evaluate_targets(m, bind_to_session(file, m)) for m in measurements]
 
         return FittedRig(fit_without_outliers(measurements, evaluate, _targets_of)[1])
@@ -100,28 +102,29 @@ def _fit_models(
     """Return the fit to labelled points from one model per session, repeated without outliers until there are none."""
     drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
 
-    def once(measurements: Sequence[Measurement], before: list[TargetModelFit] | None) -> list[TargetModelFit]:
-        """Fit all sessions once, from the models of the fit before, or else from those to begin with."""
+    def fit_once(measurements: Sequence[Measurement], before: list[TargetModelFit] | None) -> list[TargetModelFit]:
+        """Return the fit of all sessions, begun at the models of the fit before; None: at `models`."""
         begin = models if before is None else [targets.model for targets in before]
-        landmarks = [
-            initial_landmarks(corrected_capture(m, model), model.T_mount, drawing)
+        start = [
+            TargetSession(m, model, initial_landmarks(corrected_capture(m, model), model.T_mount, drawing))
             for m, model, drawing in zip(measurements, begin, drawings, strict=True)
         ]
-        return fit_targets([TargetSession(*s) for s in zip(measurements, begin, landmarks, strict=True)], recorder)
+        return fit_targets(start, recorder)
 
-    return FittedRig(fit_without_outliers(measurements, once, _targets_of)[1])
+    return FittedRig(fit_without_outliers(measurements, fit_once, _targets_of)[1])
 
 
-def _targets_of(measurements: Sequence[Measurement], targets: list[TargetModelFit]) -> list[TargetModelFit]:
-    return targets
+def _targets_of(_: Sequence[Measurement], fits: list[TargetModelFit]) -> list[TargetModelFit]:
+    """Return the labelled points of every session under a fit, as `fit_without_outliers` asks for them."""
+    return fits
 
 
 def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-    """Return the rows of the labelled points as they are."""
+    """Return the linear model of a session's labelled points about `model`; `gate` concerns clouds and is not used."""
     return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
 
 
-def finish(
+def register_session(
     session: SessionData,
     fitted: FittedRig,
     index: int,
@@ -132,25 +135,28 @@ def finish(
     method: str,
     until_screened: Callable[[], None],
 ) -> tuple[Fit, float]:
-    """Return session `index` with each view moved by its most likely pose error, and its noise floor, length_unit.
+    """Return the result of session `index` of a rig, and its noise floor, length_unit.
 
-    There is no cloud: the targets stand in for one, `method` and `until_screened` are not used.
+    Each view is moved by its most likely pose error. There is no cloud: the targets stand in for one. The signature is
+    that of `Pipeline`; `method` and `until_screened` concern clouds alone and are not used.
 
     Args:
+        fitted: all sessions of the rig with their common model.
         coarse: result of the stage before the fit.
+        recorder: is shown the stages correct and register.
         seconds: time that the fit has taken.
     """
     clock = Clock()
     targets = fitted.sessions[index].targets
     assert targets is not None
-    rows = targets.rows
-    poses_model = rows.capture.poses(targets.model.T_mount)
-    count = int(np.isfinite(rows.distances(rows.residual)).sum())
-    poses, after = register_targets(rows, targets.variances, poses_model)
+    # T_reference_scanner (V, 4, 4), of the model and with each view's own pose error.
+    poses_model = targets.rows.capture.poses(targets.model.T_mount)
+    poses, distances = register_targets(targets.rows, targets.variances, poses_model)
+    count = int(np.isfinite(targets.distances).sum())
     note = "3D distances of the targets from their fitted positions"
-    corrected = StageResult("correct", targets.rms, count, len(targets.history), seconds, note)
+    corrected = StageResult("correct", targets.rms, count, iterations=len(targets.history), seconds=seconds, note=note)
     note = "each view moved by its most likely pose error"
-    registered = StageResult("register", rms_of(after), count, 1, clock.lap(), note)
+    registered = StageResult("register", rms_of(distances), count, iterations=1, seconds=clock.lap(), note=note)
     recorder.stage(corrected, poses_model)
     recorder.stage(registered, poses)
     scatter = repeatability_from(targets.variances)
@@ -169,7 +175,10 @@ def finish(
 
 
 def _targets_as_cloud(targets: TargetModelFit) -> FusedCloud:
-    """The targets in place of a fused cloud: position, rms distance of the views from it, number of views."""
+    """Return the targets as a cloud, to stand in for a fused one, without normals.
+
+    Per target: its fitted position, the rms distance of the views from it as residual, and the number of views.
+    """
     positions = targets.landmarks.positions
     count: Array = np.minimum(targets.rows.sightings.view_counts, 65535).astype(np.int32)
     return FusedCloud(positions, np.zeros_like(positions), targets.target_rms, count)

@@ -118,7 +118,7 @@ class BlockLeastSquares:
 
     @cached_property
     def _weights(self) -> Array:
-        """(B, m) W."""
+        """(B, m) weights W of the numbers: 1 over the variance of each."""
         return 1 / np.einsum("bii->bi", self.covariance)
 
     @cached_property
@@ -137,12 +137,8 @@ class BlockLeastSquares:
         """(k, k) XᵀWX."""
         return self._sums[:-1, :-1]
 
-    def residual_vectors(self, estimates: Array) -> Array:
-        """(B, k) XᵀW(z − X·x) of every block."""
-        return np.einsum("bmk,bm->bk", self.X, self._weights * (self.z - self.X @ estimates))
-
     def solve(self, left_out: Array | Indices | None = None) -> Array:
-        """(k,) estimates, without some blocks."""
+        """Return the estimates (k,), fitted without some blocks, given by their indices; None: all count."""
         return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
 
     def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
@@ -177,23 +173,13 @@ class BlockLeastSquares:
         return inverse @ (spread + np.diag(self.precision)) @ inverse
 
     def shift_by_errors(self, errors: Array) -> Array:
-        """Return (k, q) by how much q unmodelled errors of z, (B, m, q), move the estimates."""
-        pulls = np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
-        return self._inverse @ pulls
+        """Return how far q errors of the observations, (B, m, q), each move the k estimates: (k, q), N⁻¹XᵀW·errors."""
+        return self._inverse @ np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
 
     @cached_property
     def _inverse(self) -> Array:
-        """(k, k) with all blocks."""
+        """(k, k) inverse N⁻¹ of the normal matrix XᵀWX + Q of all blocks."""
         return _pseudo_inverse(*equilibrated(self.information + np.diag(self.precision)))
-
-    def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
-        """Return the ratio of the jackknife's variance to `covariance`, at least 1: see `grouped_inflation`.
-
-        Args:
-            groups: indices of the blocks that each fit leaves out.
-            covariance: (k, k) of the estimates.
-        """
-        return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
 
 
 def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:

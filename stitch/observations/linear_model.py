@@ -39,148 +39,153 @@ from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, 
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
-# The first components of whatever was observed, by their names; what poses err beside follows them.
+# Names of the first components of every covariance; those of pose errors (`PoseErrors.names`) follow.
 WHITE_COMPONENTS = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
 _NEGLIGIBLE_SHARE = 1e-2
-# Share of a column below which what the model leaves of it is rounding, and no direction that views tell of.
+# A column of which the model leaves a smaller share is explained: the rest is rounding.
 _EXPLAINED = 1e-9
-# Models beside further columns that are kept: those of one round of a selection, but of so many numbers in all at most:
-# 2,773 poses of a probe take 40 MB each.
-_REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
-# Sets of columns that are held against a model at once: enough for one large product, few for the memory.
+# Models conditioned on further columns that are cached: those of one round of a selection, fewer where they are large,
+# as of 2,773 poses of a probe, which take 40 MB each.
+_CACHED_MODELS, _CACHED_NUMBERS = 12, 200_000
+# Sets of columns that are whitened in one product: enough to be fast, few for the memory.
 _SETS_AT_ONCE = 16
-# Numbers of the sums of views that are made at once: they stay in the cache.
+# Size of an array of sums that is computed in one piece: it stays in the processor's cache.
 _SUMS_AT_ONCE = 200_000
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
 
 
 class PointSums(Protocol):
-    """Sums of what the parameters of an effect do to the points themselves."""
+    """Sums over correspondences for parameters of effects that move points within a view (`PointGram`)."""
 
     def select(self, keep: slice | Mask) -> "PointSums":
-        """The sums of some of the parameters."""
+        """Return the sums of some of the parameters."""
 
 
 @dataclass(frozen=True)
 class CoefficientPrior:
-    """What is believed of k coefficients before anything is seen."""
+    """A normal prior of k independent coefficients."""
 
-    precision: Array  # (k,) 0 where nothing is believed
+    precision: Array  # (k,) 1/variance; 0 where nothing is believed
     mean: Array  # (k,)
 
 
 @dataclass(frozen=True)
 class Response:
-    """Columns of P parameters in the coordinates of an observation: twists of the views, or rows of targets."""
+    """How an observation changes per unit of each of P parameters, in its own coordinates."""
 
-    columns: Array  # (·, P) per unit of each parameter
-    points: PointSums | None = None  # of an effect that changes the points, where the columns do not say it all
+    columns: Array  # (·, P) left twists of the views (6V rows), or rows of targets
+    points: PointSums | None = None  # of an effect that moves points within a view, which no twist describes
 
 
 class LinearTrial(Protocol):
-    """A model with some columns, in the linear approximation."""
+    """A linear model with k columns, fitted to an observation and tested on views that were left out.
+
+    Coefficients are (u + k,): first u unknowns that the observation has of its own, then those of the columns.
+    """
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """(… + k,) coefficients by least squares, without some views; what the observation frees beside comes first."""
+        """Return the coefficients (u + k,) by least squares, fitted without some views (indices)."""
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
+        """Return the coefficients (u + k,) under each prior; columns beyond those that a prior has stay at zero."""
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
+        """Return sums of squared residuals, length_unit², of all units or some: of pairs of views, or of views."""
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Sum of the squares of what left-out views deviate from the model by, in units of their scatter."""
+        """Return the χ² of the residuals of left-out views: their squares in units of the null's scatter."""
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """(n,) views of which one alone could carry the coefficients (k,)."""
+        """Return the views (n,) of which a single one could decide the coefficients."""
 
 
 class Observation(ABC):
-    """What was observed of one session under its model: of numbers that a response counts as they are.
+    """What was observed of one session under its model, reduced to n numbers.
 
-    One whose responses count something else overrides `reduce` and `expand`; what its views share, `numbers_per_view`.
+    Changes that effects cause (responses) are in coordinates of the observation. Where these are not the reduced
+    numbers themselves, a subclass overrides `reduce` and `expand`; where each number belongs to one view,
+    `numbers_per_view`.
     """
 
-    capture: Capture  # of the views, in the order of time, without the effects in use
-    centre: Array  # (3,) about which twists of the views count, reference frame
+    capture: Capture  # of the views, in the order of time, with the effects in use taken out
+    centre: Array  # (3,) point of the reference frame about which twists of the views turn
 
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Length that makes a radian of orientation comparable with a distance."""
+        """Length, length_unit, that makes a radian of orientation comparable with a distance."""
 
     @property
     def numbers_per_view(self) -> int | None:
-        """Numbers that belong to one view, block after block; None where views share them."""
+        """How many reduced numbers each view has, which stand view after view; None where views share numbers."""
         return None
 
     @abstractmethod
     def from_twists(self, moved: Array) -> Array:
-        """(n, P) reduced observations of left twists (6V, P) of the views."""
+        """Return the change (n, P) of the reduced numbers by left twists (6V, P) of the views."""
 
     @abstractmethod
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
-        """Per term how the observation answers to its parameters."""
+        """Return per term how the observation changes with its parameters, at `model`."""
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) reduced observations of a response (·, P)."""
+        """Return the change (n, P) of the reduced numbers for a change (·, P) in the observation's coordinates."""
         return response
 
     def expand(self, columns: Array) -> Array:
-        """(·, P) a response that has these reduced observations (n, P)."""
+        """Return a change (·, P) in the observation's coordinates that `reduce` maps to `columns` (n, P)."""
         return columns
 
     @abstractmethod
     def trial(self, linear: "LinearModel", response: Array, points: PointSums | None = None) -> LinearTrial:
-        """A model with the columns of a response (·, k); `points` belong to its last ones."""
+        """Return the trial of a model with columns `response` (·, k); `points` are sums of the last of them."""
 
     @abstractmethod
     def affected_squares(self, views: Indices) -> Mask:
-        """(units,) which squares of a trial some views have a part in."""
+        """Return a mask (units,) of the sums of `LinearTrial.squares` that any of the views has a part in."""
 
     @cached_property
     def folds(self) -> list[Indices]:
-        """Groups of views to leave out."""
+        """Groups of views that are left out in turn: neighbours in time or pose."""
         return grouped_folds(self.capture.T_base_flange, self.reach)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
-        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
+        """Return ends of joints' ranges to leave out, from joints (V, n) rad; none where views share squares."""
         return []
 
     @abstractmethod
     def part_displacements(self, numbers: Array) -> Array:
-        """(V, 3) what reduced observations (n,) displace at the part, reference frame, without a common motion."""
+        """Return displacements (V, 3) at the part that make reduced numbers (n,), less their mean; reference frame."""
 
 
 @dataclass(frozen=True)
 class LinearModel:
-    """One session under its model: what was seen beside hand-eye, landmarks and effects in use, reduced.
+    """One session under its model: z = A·α + noise, of n reduced numbers z, with the noise's variances fitted to z.
 
-    How large the errors of what was seen are, the numbers tell.
+    The a coefficients α are those of hand-eye, landmarks and effects in use.
     """
 
     measurement: Measurement
     model: Model
     observation: Observation
-    design: Array  # (·, a) response to hand-eye, landmarks and effects in use
+    design: Array  # (·, a) columns of A in the observation's coordinates
     _: KW_ONLY
-    sizes: Array  # (a,) plausible ones of the effects' parameters; infinite for the rest
-    values: Array  # (a,) at which the parameters of effects in use stand; 0 for the rest
-    mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
-    null: VarianceFit  # fitted without further columns
-    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, reduced (c, n, n)
-    # (B, m, n) plausible offsets of the joints, each block a view, where the covariance counts no scatter of theirs.
+    sizes: Array  # (a,) plausible sizes of the effects' parameters; infinite for the rest
+    values: Array  # (a,) present values of the effects' parameters; 0 for the rest
+    mixed: MixedModel  # z, A and the components of the covariance
+    null: VarianceFit  # variances of the components, fitted without further columns
+    pose_errors: PoseErrors | None = None  # pose errors beside white scatter; its components are (c, n, n) of z
+    # (B, m, joints) changes of z by plausible offsets of the joints, where the covariance has no scatter of the joints.
     offsets: Array | None = None
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
     flange_per_joint: Array = field(default_factory=lambda: np.zeros(2))
-    full_model: "LinearModel | None" = None  # the one that this was taken from, where some pose errors are left out
+    full_model: "LinearModel | None" = None  # from which this was restricted, if some causes are left out
 
     @cached_property
     def satterthwaite(self) -> Satterthwaite:
-        """How well the null's scatter is known."""
+        """How well the variances of `null` are known, as degrees of freedom."""
         return satterthwaite(self.mixed, self.null)
 
     def flange_scatter(self, fit: VarianceFit) -> Array:
@@ -197,18 +202,18 @@ class LinearModel:
 
     @property
     def component_names(self) -> tuple[str, ...]:
-        """Components beside the flange's scatter and noise; without a prior of pose errors joints may scatter still."""
+        """Names of the components after `WHITE_COMPONENTS`: pose errors, or joint scatter alone, or none."""
         if self.pose_errors is not None:
             return self.pose_errors.names
         return (JOINT_SCATTER,) if self.mixed.further is not None else ()
 
     @property
     def causes(self) -> frozenset[str]:
-        """Names of all that poses err by beside white scatter: effects of the library, and other components."""
+        """Names of the causes of pose errors: effects of the library, and components that are not made of effects."""
         return frozenset(self.component_names) if self.pose_errors is None else self.pose_errors.causes
 
     def in_blocks(self, columns: Array) -> Array:
-        """(B, m, P) columns (n, P) as the variance components take them."""
+        """Return columns (n, P) as (B, m, P), in the B independent blocks of m numbers that `mixed` has."""
         return columns.reshape(*self.mixed.z.shape, columns.shape[1])
 
     @cached_property
@@ -227,12 +232,12 @@ class LinearModel:
         The covariance is that of `null`, the variances fitted without further columns.
 
         Args:
-            blocks: the blocks (rows of the B) whose columns are returned; None: all.
+            blocks: numbers of the blocks whose rows are returned, in this order, among the B of `in_blocks`; None: all.
         """
-        X, half = self.in_blocks(columns), self.whitening
+        X, inverse_root = self.in_blocks(columns), self.whitening
         if blocks is not None:
-            X, half = X[blocks], half[blocks]
-        return (half @ X).reshape(-1, columns.shape[1])
+            X, inverse_root = X[blocks], inverse_root[blocks]
+        return (inverse_root @ X).reshape(-1, columns.shape[1])
 
     def restricted(self, keep: Collection[str]) -> Self:
         """Return the model in which poses err by these causes alone, its variances fitted anew.
@@ -257,7 +262,7 @@ class LinearModel:
 
     @cached_property
     def _restricted(self) -> dict[frozenset[str], Self]:
-        """What `restricted` has fitted already."""
+        """Cache of `restricted`, by the causes kept."""
         return {}
 
     def _fit_restricted(self, kept: frozenset[str]) -> Self:
@@ -321,31 +326,31 @@ class LinearModel:
         return tuple(replace(self, null=at_variances(self.mixed, variances)) for variances in starts)
 
     def responses(self, terms: Sequence[Term]) -> list[Response]:
-        """Per term how the observation answers to its parameters."""
+        """Return per term how the observation changes with its parameters."""
         return self.observation.responses(self.measurement, self.model, terms)
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) reduced observations of a response (·, P)."""
+        """Return the change (n, P) of the reduced numbers for a change (·, P) in the observation's coordinates."""
         return self.observation.reduce(response)
 
     @cached_property
     def white_design(self) -> Array:
-        """(n, a) `design` in units of the null's scatter."""
+        """(n, a) columns A, whitened."""
         return self.whiten(self.reduce(self.design))
 
     @cached_property
     def white_z(self) -> Array:
-        """(n,) what was seen in those units, with all that the model explains."""
+        """(n,) reduced numbers z, whitened."""
         return self.whiten(self.mixed.z.reshape(-1, 1))[:, 0]
 
     @cached_property
     def white_residual(self) -> Array:
-        """(n,) what was seen in those units, without what the model explains."""
+        """(n,) whitened z, less its projection onto the whitened columns A."""
         return self.residual(self.mixed.z.reshape(-1, 1))[:, 0]
 
     @cached_property
     def _explained(self) -> Array:
-        """(n, r) orthonormal basis of `white_design`."""
+        """(n, r) orthonormal basis of the space of `white_design`."""
         return column_space(self.white_design)
 
     def explained_without(self, views: Indices) -> Array:
@@ -377,13 +382,13 @@ class LinearModel:
                 common.keep([selected.whole for selected in sets])
                 yield from map(self._own_information.of, sets)
                 continue
-            portion = [selected.columns for selected in sets]
-            white = self.whiten(np.hstack(portion))
+            white = self.whiten(np.hstack([selected.columns for selected in sets]))
             explained = self._explained.T @ white
             vector = white.T @ self.white_residual
-            ends = np.cumsum([0, *(X.shape[1] for X in portion)])
-            for at in map(slice, ends[:-1], ends[1:]):
-                yield white[:, at].T @ white[:, at] - explained[:, at].T @ explained[:, at], vector[at]
+            ends = np.cumsum([0, *(selected.count for selected in sets)])
+            for of_set in map(slice, ends[:-1], ends[1:]):
+                X, projected = white[:, of_set], explained[:, of_set]
+                yield X.T @ X - projected.T @ projected, vector[of_set]
 
     def information_of_motions(self, twists: Array, shapes: Array) -> tuple[Array, Array]:
         """Return I (S, kR, kR) and v (S, kR): in each of S sets the log likelihood of kR coefficients is vᵀθ − ½ θᵀIθ.
@@ -395,45 +400,38 @@ class LinearModel:
             twists: (V, 6, k) of the views about the observation's centre (rad, length_unit), per unit of each motion.
             shapes: (S, V, R) factors of the views.
         """
-        of_views, across, sign, vector = self._sums_of_twists
+        own, shared, sign, pulls = self._sums_of_twists
         (sets, views, count), k = shapes.shape, twists.shape[2]
-        of_views = (twists.transpose(0, 2, 1) @ of_views @ twists).reshape(views, 1, k * k)
-        information = np.empty((sets, count, k, count, k))
-        portion = max(_SUMS_AT_ONCE // (views * count * k * k), 1)
-        for at in (slice(start, start + portion) for start in range(0, sets, portion)):
-            some = shapes[at]
-            weighted = (some[..., None] * of_views).reshape(len(some), views, -1)
-            sums = (some.transpose(0, 2, 1) @ weighted).reshape(-1, count, count, k, k)
-            information[at] = sums.transpose(0, 1, 3, 2, 4)
+        information = _sum_over_views(twists.transpose(0, 2, 1) @ own @ twists, shapes)
         by_shape = shapes.transpose(0, 2, 1).reshape(-1, views)
-        by_motion = (by_shape @ (across @ twists).reshape(views, -1)).reshape(sets, count, -1, k)
-        shared = by_motion.transpose(0, 2, 3, 1).reshape(sets, -1, k * count)
-        seen = (by_shape @ np.einsum("vi,vik->vk", vector, twists)).reshape(sets, count, k)
-        whole = information.transpose(0, 2, 1, 4, 3).reshape(sets, k * count, k * count)
-        return whole + sign * shared.transpose(0, 2, 1) @ shared, seen.transpose(0, 2, 1).reshape(sets, -1)
+        moved = (by_shape @ (shared @ twists).reshape(views, -1)).reshape(sets, count, -1, k)
+        moved = moved.transpose(0, 2, 3, 1).reshape(sets, -1, k * count)
+        pulled = (by_shape @ np.einsum("vi,vik->vk", pulls, twists)).reshape(sets, count, k)
+        return information + sign * moved.transpose(0, 2, 1) @ moved, pulled.transpose(0, 2, 1).reshape(sets, -1)
 
     @cached_property
     def _sums_of_twists(self) -> tuple[Array, Array, float, Array]:
-        """D (V, 6, 6), F (V, r, 6), sign s, q (V, 6): sums over unit twists of the views for `information_of_motions`.
+        """Return D (V, 6, 6), F (V, r, 6), a sign s and q (V, 6): products of unit twists of the views.
 
         With the 6 whitened unit twists of view v as columns U_v, the model's columns projected out, the information of
         two views is U_vᵀU_w = δ_vw D_v + s F_vᵀF_w. q_v is U_vᵀ times the whitened residual.
         """
         views, rows = self.measurement.views.count, self.observation.numbers_per_view
-        # Views share numbers: U_v has all n rows and is F_v itself. Else D_v is the block of the view, and what the
-        # model explains (an orthonormal basis of r columns) is subtracted by F.
+        # Where views share numbers, U_v has all n rows and is F_v itself. Else D_v is of the rows of the view alone;
+        # F subtracts what the model explains, by its orthonormal basis of r columns.
         if rows is None:
             unit = self.residual(self.observation.from_twists(np.eye(6 * views)))
-            across = unit.reshape(-1, views, 6).transpose(1, 0, 2)
-            return np.zeros((views, 6, 6)), across, 1.0, (unit.T @ self.white_residual).reshape(views, 6)
+            shared = unit.reshape(-1, views, 6).transpose(1, 0, 2)
+            return np.zeros((views, 6, 6)), shared, 1.0, (unit.T @ self.white_residual).reshape(views, 6)
         unit = self.whiten(self.observation.from_twists(np.tile(np.eye(6), (views, 1)))).reshape(-1, rows, 6)[:views]
-        turned = unit.transpose(0, 2, 1)
-        across = (turned @ self._explained.reshape(-1, rows, self._explained.shape[1])[:views]).transpose(0, 2, 1)
-        vector = (turned @ self.white_residual.reshape(-1, rows, 1)[:views])[..., 0]
-        return turned @ unit, across, -1.0, vector
+        transposed = unit.transpose(0, 2, 1)
+        shared = (transposed @ self._explained.reshape(-1, rows, self._explained.shape[1])[:views]).transpose(0, 2, 1)
+        pulls = (transposed @ self.white_residual.reshape(-1, rows, 1)[:views])[..., 0]
+        return transposed @ unit, shared, -1.0, pulls
 
     @cached_property
     def _own_information(self) -> ModelInformation:
+        """What `information` needs of this model at the variances of `null`; of models with `mixed.common` alone."""
         return model_information(self.mixed, self.null)
 
     def conditioned_on(
@@ -470,27 +468,27 @@ class LinearModel:
                 conditioned = replace(conditioned, null=null)
             else:
                 conditioned = conditioned.refit()
-            if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // max(self.mixed.size, 1)):
+            if len(self._conditioned) >= min(_CACHED_MODELS, _CACHED_NUMBERS // max(self.mixed.size, 1)):
                 self._conditioned.clear()
             self._conditioned[key] = conditioned
         return conditioned
 
     @cached_property
     def _conditioned(self) -> dict[tuple[Any, ...], "LinearModel"]:
-        """What `conditioned_on` has found last: effects are asked beside the same others several times."""
+        """Cache of `conditioned_on`, by columns and sizes: several effects are tested beside the same others."""
         return {}
 
     def trial(self, response: Array, points: PointSums | None = None) -> LinearTrial:
-        """A model with the columns of a response (·, k)."""
+        """Return the trial of a model with columns `response` (·, k); `points` are sums of the last of them."""
         return self.observation.trial(self, response, points)
 
     @cached_property
     def baseline_trial(self) -> LinearTrial:
-        """The model as it is."""
+        """The trial of the model as it is, without further columns."""
         return self.trial(self.design)
 
     def view_displacements(self) -> Array:
-        """(V, 3) how far every view sits from where the model puts it, at the part, reference frame."""
+        """Return how far (V, 3), length_unit, the part's points of every view lie from the model, reference frame."""
         explained = self.design @ self.baseline_trial.solve()[-self.design.shape[1] :]
         return self.observation.part_displacements(self.mixed.z.ravel() - self.reduce(explained[:, None])[:, 0])
 
@@ -498,7 +496,25 @@ class LinearModel:
         return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"
 
 
+def _sum_over_views(matrices: Array, shapes: Array) -> Array:
+    """Return Σ_v shapes[s, v, r] shapes[s, v, q] M_v for all r and q: (S, kR, kR), entry (i, r), (j, q) from M_v[i, j].
+
+    Args:
+        matrices: M (V, k, k).
+        shapes: (S, V, R) factors of the views; `_SUMS_AT_ONCE` says of how many sets at a time.
+    """
+    (sets, views, count), k = shapes.shape, matrices.shape[1]
+    out = np.empty((sets, k, count, k, count))
+    portion = max(_SUMS_AT_ONCE // (views * count * k * k), 1)
+    for at in (slice(start, start + portion) for start in range(0, sets, portion)):
+        some = shapes[at]
+        weighted = (some[..., None] * matrices.reshape(views, 1, k * k)).reshape(len(some), views, -1)
+        sums = (some.transpose(0, 2, 1) @ weighted).reshape(-1, count, count, k, k)
+        out[at] = sums.transpose(0, 3, 1, 4, 2)
+    return out.reshape(sets, k * count, k * count)
+
+
 def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
-    """Return the mixed model of one block with scatter, noise, and what the poses err beside."""
+    """Return a mixed model of one block with its components of scatter and noise, and those of pose errors."""
     components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
     return replace(mixed, components=components, further=errors.prior, common=None)

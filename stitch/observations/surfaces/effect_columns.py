@@ -5,6 +5,7 @@ look like to the poses is H⁺BᵀWg, with g the change of the distance e per un
 memory never grows with the points.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -38,7 +39,7 @@ class PointGram:
     square: Array  # (P, K, K) Σ w g gᵀ
 
     def select(self, keep: slice | Mask) -> "PointGram":
-        """The sums of some of the parameters."""
+        """Return the sums of some of the parameters."""
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
 
     def merge_sides(self, per_view: int) -> "PointGram":
@@ -91,13 +92,13 @@ def view_responses(
 
 
 def view_columns(measurement: Measurement, model: Model, unconstrained: UnconstrainedPoses) -> Array:
-    """Return twists (6V, P) of the views for all parameters of the effects in use."""
+    """Return the left twists (6V, P) of the views per unit of each parameter of the effects in use."""
     columns = [r.columns for r in view_responses(measurement, model, model.terms, unconstrained)]
     return np.hstack([np.zeros((6 * len(unconstrained.poses), 0)), *columns])
 
 
 def apparent_twists(points: PointGram, unconstrained: UnconstrainedPoses) -> Array:
-    """Return H⁺BᵀWg (6V, K): what point effects do to poses that overlaps and targets alone determine."""
+    """Return the twists (6V, K) of the views, H⁺BᵀWg, that overlaps and targets alone would make of moved points."""
     return solve_views(unconstrained.overlaps.gram, points.vector)
 
 
@@ -125,35 +126,38 @@ def stream_point_sums(
     g = unconstrained.overlaps.gram
 
     def slopes(v: int, index: Indices, normal: Array) -> Array:
-        """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
+        """Return how far (N, K) points `index` of view v move along normals (N, 3), reference frame, per unit."""
         in_scanner = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
-        # A point is asked by several partners, and moves alike for all.
-        points, asked = np.unique(index, return_inverse=True)
-        return np.einsum("kni,ni->nk", of_points(v, points).take(asked, axis=1), in_scanner)
+        # A point has several partners, and moves alike for all.
+        points, position = np.unique(index, return_inverse=True)
+        return np.einsum("kni,ni->nk", of_points(v, points).take(position, axis=1), in_scanner)
 
+    # By number of the match, so of the pair: Σ w Bᵀg, Σ w g e and Σ w g gᵀ, summed over its parts.
     sums = dict[int, tuple[Array, ...]]()
     for block in _match_blocks(unconstrained.overlaps.matches):
         changes = _split_by_view(_distance_changes([m for _, m in block], slopes), per_view)
         end = 0
-        for pair, m in block:
+        for number, m in block:
             start, end = end, end + len(m.residual)
-            change = changes[start:end]
-            weighted = change * (m.weight * tukey(m.residual, g.scale))[:, None]
+            g_rows = changes[start:end]
+            weighted = g_rows * (m.weight * tukey(m.residual, g.scale))[:, None]
             B = frames.plane_rows(m.middle - g.centre, m.normal)
-            more = (B.T @ weighted, weighted.T @ m.residual, weighted.T @ change)
-            sums[pair] = tuple(map(np.add, sums[pair], more)) if pair in sums else more
-    rows = [sums[pair] for pair in sorted(sums)]
+            more = (B.T @ weighted, weighted.T @ m.residual, weighted.T @ g_rows)
+            sums[number] = tuple(map(np.add, sums[number], more)) if number in sums else more
+    rows = [sums[number] for number in sorted(sums)]
     rows += _target_pair_sums(unconstrained, noise_factor, of_targets, per_view)
-    return PointGram(*(np.array([row[i] for row in rows]) for i in range(3)))
+    vectors, residuals, squares = (np.array(column) for column in zip(*rows, strict=True))
+    return PointGram(vectors, residuals, squares)
 
 
 def _split_by_view(changes: Array, per_view: int) -> Array:
     """Return the changes of a distance per parameter, (…, K + per_view), from those by each view of a pair, (…, 2, K).
 
-    The first `per_view` parameters count once for each view; of the others the changes by both views are added.
+    The first `per_view` parameters have a value for each view: they come twice, for the first view and for the second.
+    The others are the same for both views, whose changes are added.
     """
-    sides = [changes[..., side, :per_view] for side in range(2)] if per_view else []
-    return np.concatenate([*sides, changes[..., per_view:].sum(axis=-2)], axis=-1)
+    own = [changes[..., view, :per_view] for view in range(2)] if per_view else []
+    return np.concatenate([*own, changes[..., per_view:].sum(axis=-2)], axis=-1)
 
 
 def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
@@ -177,8 +181,8 @@ def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]
 def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
     """Return the changes (N, 2, K) of the distances of N correspondences by the points of the first and second view.
 
-    Per unit of each of K parameters, all matches one after the other. The point of the second view counts negative, as
-    in the distance. Each view is asked once for all its points, since a call costs more than its points.
+    They are per unit of each of K parameters, match after match. The point of the second view counts negative, as in
+    the distance. `slopes` is called once a view, with all its points: a call costs more than its points.
 
     Args:
         slopes: called with a view, numbers (n,) of its points and their normals (n, 3); returns (n, K), how far these
@@ -186,21 +190,19 @@ def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, 
     """
     ends = np.cumsum([len(m.residual) for m in matches])
     normal = np.concatenate([m.normal for m in matches])
-    # Per side of a pair the view, its points, the rows of the pair, and whether it is the second view.
-    sides = list[tuple[int, Indices, Indices, int]]()
+    # By view: per match that it is in, its points, their rows among the N, and 1 where it is the second view, else 0.
+    queries = defaultdict[int, list[tuple[Indices, Indices, Indices]]](list)
     for second in range(2):
         for m, end in zip(matches, ends, strict=True):
             rows = np.arange(end - len(m.residual), end)
-            sides.append((m.w, m.index_w, rows, 1) if second else (m.v, m.index_v, rows, 0))
+            view, index = (m.w, m.index_w) if second else (m.v, m.index_v)
+            queries[view].append((index, rows, np.full(len(rows), second)))
     out = np.zeros((len(normal), 2, 0))
-    for view in sorted({side[0] for side in sides}):
-        of_view = [side for side in sides if side[0] == view]
-        index = np.concatenate([side[1] for side in of_view])
-        at = np.concatenate([side[2] for side in of_view])
-        is_second = np.concatenate([np.full(len(side[2]), side[3]) for side in of_view])
-        moved = slopes(view, index, normal.take(at, axis=0))
+    for view in sorted(queries):
+        index, rows, is_second = (np.concatenate(column) for column in zip(*queries[view], strict=True))
+        moved = slopes(view, index, normal.take(rows, axis=0))
         out = out if out.shape[2] else np.zeros((len(normal), 2, moved.shape[1]))
-        out[at, is_second] = np.where(is_second[:, None] == 1, -moved, moved)
+        out[rows, is_second] = np.where(is_second[:, None] == 1, -moved, moved)
     return out
 
 

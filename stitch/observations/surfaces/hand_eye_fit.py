@@ -41,11 +41,11 @@ from stitch.system.values import Value, take_rows
 
 # Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
 SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
-# White scatter of more numbers is known well enough to take its maximum.
+# From so many numbers the variances of white scatter are known well enough: their maximum is used, not their mean.
 _PLUG_IN = 300
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
 _OBSERVABLE_SHARE = 1e-6
-# Precision along what the motions do not show, over that of the weak prior: it stays where it is.
+# Factor on the prior's precision along directions that the motions do not show: there the hand-eye does not move.
 _HELD = 1e12
 
 
@@ -64,13 +64,17 @@ class Repeatability(Value):
 
     @property
     def variances(self) -> Array:
-        """(3,) of rotation and translation, and the noise factor."""
+        """(3,) variances of rotation (rad²) and translation (length_unit²), and the noise factor."""
         return np.array([self.rotation**2, self.translation**2, self.noise_factor])
 
 
 @dataclass(frozen=True)
 class ReducedPoses:
-    """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
+    """The poses of the views as n numbers z: their twists along the directions that overlaps and common targets see.
+
+    Twists are left twists about the centre of the overlaps, from the model's poses to those that the overlaps alone
+    give.
+    """
 
     reduction: Array  # (n, 6V) from twists of the views to visible directions
     expansion: Array  # (6V, n) back to the shortest twists, a radian as long as what it moves at the part
@@ -83,28 +87,28 @@ class ReducedPoses:
 
 @dataclass(frozen=True)
 class CaptureEvidence:
-    """What one capture says about hand-eye and effects: its pairs and its free-network views."""
+    """What one capture says about hand-eye and effects: sums over its pairs of views, and its free-network poses."""
 
     capture: Capture
     gram: Gram
-    twists: Array  # (V, 6)
-    hand_eye_frames: Array  # (V, 4, 4) of the hand-eye
-    effect_twists: Array  # (6V, P)
-    common_twists: Array  # (6V, K) by errors of scanners that the answer counts; none of one scanner
+    twists: Array  # (V, 6) left twists about the Gram's centre, from the model's poses to the free-network poses
+    hand_eye_frames: Array  # (V, 4, 4) T_reference_mount·T_mount
+    effect_twists: Array  # (6V, P) left twists of the views per unit of each effect's parameter
+    common_twists: Array  # (6V, K) per sigma of errors of several scanners that the fit counts; K = 0 for one scanner
 
     @cached_property
     def reduced_poses(self) -> ReducedPoses:
-        """The visible directions of the views."""
+        """The twists reduced to the directions that the overlaps see, linearised about the hand-eye."""
         return reduce_poses(self.gram, self.twists, self.hand_eye_frames, self.capture)
 
     @property
     def effect_columns(self) -> Array | None:
-        """(n, P) the effects' columns in the visible directions; None without effects."""
+        """(n, P) change of the reduced poses per unit of each effect's parameter; None without effects."""
         return self.reduced_poses.reduction @ self.effect_twists if self.effect_twists.shape[1] else None
 
     @property
     def common_columns(self) -> Array:
-        """(n, K) visible directions of the same."""
+        """(n, K) change of the reduced poses per sigma of each error of `common_twists`."""
         return self.reduced_poses.reduction @ self.common_twists
 
     def without(self, views: Indices) -> "CaptureEvidence":
@@ -127,9 +131,9 @@ class CaptureEvidence:
         """
         touched = np.isin(self.gram.pairs, views).any(axis=1)
         J = np.column_stack([hand_eye_jacobian(self.hand_eye_frames, self.gram.centre), self.effect_twists])
-        # The correspondences are those of views moved by `twists` from the robot's poses.
-        moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
-        return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
+        # The sums are at the free-network poses, which are `twists` away from the model's.
+        from_free = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
+        return np.array([pair_squares(self.gram, twists)[touched].sum() for twists in from_free])
 
 
 @dataclass(frozen=True)
@@ -140,12 +144,12 @@ class RigModel:
 
     @cached_property
     def z(self) -> Array:
-        """(N,) what was seen."""
+        """(N,) reduced poses of all sessions, one after the other."""
         return np.concatenate([e.reduced_poses.z for e in self.parts])
 
     @cached_property
     def columns(self) -> Array:
-        """(N, 6 + P) of hand-eye and effects."""
+        """(N, 6 + P) columns X of hand-eye and effects."""
         reduced = [(e.reduced_poses, e.effect_twists) for e in self.parts]
         return np.concatenate([np.column_stack([r.hand_eye, r.reduction @ twists]) for r, twists in reduced])
 
@@ -184,7 +188,7 @@ class RigModel:
         return replace(mixed, fixed=shared) if shared.any() else mixed
 
     def reduce(self, twists: Sequence[Array]) -> Array:
-        """Return the visible directions (N, K) of twists (6V, K) of every session."""
+        """Return the visible directions (N, K) of twists, given as (6V, K) per session."""
         return np.concatenate([e.reduced_poses.reduction @ t for e, t in zip(self.parts, twists, strict=True)])
 
 
@@ -199,22 +203,24 @@ class FittedEffects:
 
 @dataclass(frozen=True)
 class HandEyeSolution:
-    """The linear problem of hand-eye and effects, and its answer x (6 + P,)."""
+    """The linear problem of hand-eye and effects, and its solution x (6 + P,): a twist ξ, then changes of the
+    parameters.
+    """
 
     rig: RigModel
-    scatter: tuple[Repeatability, ...]
+    scatter: tuple[Repeatability, ...]  # per session
     prior: Array  # (6 + P, 6 + P) precision
-    prior_vector: Array  # (6 + P,)
+    prior_vector: Array  # (6 + P,) precision times mean
     gls: GeneralisedFit
     x: Array
-    values: Array  # (P,) of the effects at which it was made
+    values: Array  # (P,) of the parameters before the step
     hidden: Array  # (6, m) twists of the hand-eye that the motions do not show, one sigma of the weak prior each
-    T_mount: Array  # (4, 4) where it leads
+    T_mount: Array  # (4, 4) after the step
 
 
 @dataclass(frozen=True)
 class HandEyeFit:
-    """Hand-eye and its statistics; twists are right perturbations T·exp(ξ), rotation first."""
+    """Hand-eye and its statistics; covariances are those of right perturbations T·exp(ξ), rad before length_unit."""
 
     T_mount: Array  # (4, 4) T_mount_scanner
     covariance: Array  # (6, 6)
@@ -224,12 +230,12 @@ class HandEyeFit:
     # Shares of what may be wrong in the variance of its rotation and of its position; each adds up to 1.
     rotation_shares: dict[str, float] = field(default_factory=dict)
     position_shares: dict[str, float] = field(default_factory=dict)
-    # Degrees of freedom on which the covariance rests: numbers that are seen beyond hand-eye and effects; None: it is
-    # another run's.
+    # Degrees of freedom: visible directions less hand-eye and effects; None where the hand-eye is another run's.
     degrees: int | None = None
-    values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
+    values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects' parameters
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
-    visible_covariance: Array = field(default_factory=lambda: np.zeros((6, 0)))  # (6, 6 + P), without what is hidden
+    # (6, 6 + P) of ξ with itself and the parameters, without the prior's part in directions that no motion shows.
+    visible_covariance: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     @property
     def values_sigma(self) -> Array:
@@ -310,17 +316,18 @@ def _variance_sources(
     # Of white scatter alone the solution has the variances already: the fit begins there.
     start = None if errors.names else solution.scatter[0].variances
     fit = fit_variances(mixed, start=start, both_starts=True)
-    mean = fit.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, fit)
-    components = zip((*WHITE_COMPONENTS, *errors.names), mean, mixed.components[:, 0], strict=True)
+    is_well_known = not errors.names and mixed.size > _PLUG_IN
+    variances = fit.variances if is_well_known else mean_variances(mixed, fit)
+    components = zip((*WHITE_COMPONENTS, *errors.names), variances, mixed.components[:, 0], strict=True)
     sources = {name: variance * gls.gain @ C @ gls.gain.T for name, variance, C in components}
     for name, twists in scanner_errors.items():
         columns = rig.reduce(twists)
-        repeated = gls.gain @ columns
+        shift = gls.gain @ columns
         # One scanner's scale shows in the views themselves: it is known better than by its sigma, or is off by more.
         if name == SCANNER_SCALE and not rig.parts[0].common_twists.size:
-            scatter = np.einsum("c,cij->ij", mean, mixed.components[:, 0])
-            repeated = repeated @ _posterior_root(rig, scatter, columns)
-        sources[name] = repeated @ repeated.T
+            scatter = np.einsum("c,cij->ij", variances, mixed.components[:, 0])
+            shift = shift @ _posterior_root(rig, scatter, columns)
+        sources[name] = shift @ shift.T
     sources["unseen"] = gls.covariance @ solution.prior @ gls.covariance
     return sources
 
@@ -344,7 +351,12 @@ def _posterior_root(rig: RigModel, scatter: Array, errors: Array) -> Array:
 
 
 def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
-    """Return the share of every source in the variance of some axes of the hand-eye together."""
+    """Return by source its share in the variance of some axes of the hand-eye, summed over these axes.
+
+    Args:
+        sources: by name, parts (6 + P, 6 + P) of the covariance.
+        axes: which of the numbers of ξ.
+    """
     squares = {name: float(np.trace(matrix[axes, axes])) for name, matrix in sources.items()}
     return {name: square / max(sum(squares.values()), 1e-300) for name, square in squares.items()}
 
@@ -355,17 +367,19 @@ def _heldout_ratio(solution: HandEyeSolution) -> float:
     Views are left out in groups, one group at a time; NaN where there is none. Scatter is not estimated again.
     """
     parts = list(zip(solution.rig.parts, solution.scatter, strict=True))
-    outside = np.zeros(2)
+    # Σ w e² of the pairs with left-out views, under the fits without them and under the fit of all.
+    squares = np.zeros(2)
     for k, (e, scatter) in enumerate(parts):
         for fold in grouped_folds(e.capture.T_base_flange, max(e.gram.lever, 1e-9)):
-            fewer = e.without(fold)
+            kept = e.without(fold)
             rest = parts[:k] + parts[k + 1 :]
-            rest += [(fewer, scatter)] if len(fewer.gram.pairs) else []
+            if len(kept.gram.pairs):
+                rest.append((kept, scatter))
             if rest:
                 rig = RigModel([part for part, _ in rest])
                 gls = rig.fit_gls([of_part for _, of_part in rest], solution.prior)
-                outside += e.squares(fold, (gls.solve(rig.z, solution.prior_vector), solution.x))
-    return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+                squares += e.squares(fold, (gls.solve(rig.z, solution.prior_vector), solution.x))
+    return float(np.sqrt(squares[0] / squares[1])) if squares[1] > 0 else float("nan")
 
 
 def solve_hand_eye(
@@ -386,12 +400,14 @@ def solve_hand_eye(
         common: per capture left twists (6V, K) of the views per sigma of K further errors, counted in the covariance
             of the observations; (): there are none.
     """
-    none = tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained)
+    no_columns = tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained)
     if effects is None:
-        effects = FittedEffects(none, np.zeros(0), np.zeros(0))
+        effects = FittedEffects(no_columns, np.zeros(0), np.zeros(0))
     parts = [
-        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), twists, shared)
-        for c, f, twists, shared in zip(captures, unconstrained, effects.twists, common or none, strict=True)
+        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), of_effects, of_errors)
+        for c, f, of_effects, of_errors in zip(
+            captures, unconstrained, effects.twists, common or no_columns, strict=True
+        )
     ]
     rig = RigModel(parts)
     scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns, e.common_columns) for e in parts)
@@ -417,7 +433,12 @@ def solve_hand_eye(
 
 
 def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) -> Array:
-    """Return twists (6, m) of the hand-eye that the motions do not show, one sigma of the prior each."""
+    """Return twists (6, m) of the hand-eye that the motions do not show, each as long as one sigma of the prior.
+
+    Args:
+        T_mount: (4, 4) maps scanner to mount.
+        prior: (6 + P, 6 + P) precision; that of the hand-eye is diagonal.
+    """
     sigma = np.diag(prior)[:6] ** -0.5
     visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
     return sigma[:, None] * null_space(visible.T, rcond=1e-9)
@@ -426,7 +447,7 @@ def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) ->
 def step_hand_eye(
     captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array
 ) -> tuple[Array, tuple[Repeatability, ...]]:
-    """Return T_mount (4, 4) as `fit_hand_eye` finds it, without statistics, and how the poses scatter per capture."""
+    """Return T_mount (4, 4) by one step of `solve_hand_eye` without effects, and how the poses scatter, per capture."""
     solution = solve_hand_eye(captures, unconstrained, T_mount)
     return solution.T_mount, solution.scatter
 
@@ -451,7 +472,11 @@ def weak_prior(
 
 
 def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
-    """Return left twists (6V, 6) of the views about `centre` for a right perturbation of the hand-eye."""
+    """Return left twists (6V, 6) of the views about `centre` (3,) per right twist of the hand-eye, T_mount·exp(ξ).
+
+    Args:
+        hand_eye_frames: (V, 4, 4) T_reference_mount·T_mount.
+    """
     return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
 
 
@@ -475,9 +500,9 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Captur
     # (V, n, 6) visible directions per unit rotation and translation of the flange in each view.
     blocks = reduction.reshape(len(reduction), -1, 6).transpose(1, 0, 2) @ carried
     if capture.stop is not None:
-        # One scatter a stop, not one a view.
-        of_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
-        np.add.at(blocks, capture.stop, of_view)
+        # Views scanned at one stop share its scatter: their blocks are added.
+        by_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
+        np.add.at(blocks, capture.stop, by_view)
     return ReducedPoses(
         reduction=reduction,
         expansion=seen.scale[:, None] * seen.vectors,
@@ -490,7 +515,11 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Captur
 
 
 def hand_eye_mixed_model(reduced: ReducedPoses, further: Array | None = None) -> MixedModel:
-    """Return the reduced poses as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
+    """Return the mixed model of reduced poses, one block, with the hand-eye and further columns as its free mean.
+
+    Args:
+        further: (n, K) columns; None: the hand-eye alone.
+    """
     mean = reduced.hand_eye if further is None else np.column_stack([reduced.hand_eye, further])
     components = np.array([reduced.rotation, reduced.translation, reduced.noise])[:, None]
     return MixedModel(reduced.z[None], mean_basis(mean)[None], components)
@@ -521,12 +550,12 @@ def estimate_repeatability(
 
 
 def repeatability_from(variances: Array) -> Repeatability:
-    """Return standard deviations (rad, length_unit) and noise factor from the three variances (3,)."""
+    """Return variances (3,) of rotation, translation and noise factor as a `Repeatability`."""
     return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
 
 
 def pose_covariance(reduced: ReducedPoses, scatter: Repeatability) -> Array:
-    """Return the covariance (n, n) of the reduced poses' z."""
+    """Return the covariance (n, n) of reduced poses z for a scatter of the flange and a noise factor."""
     return (
         scatter.rotation**2 * reduced.rotation
         + scatter.translation**2 * reduced.translation
@@ -552,15 +581,15 @@ def whiten_captures(
     for capture, views, twists in sessions:
         hand_eye_frames = capture.hand_eye_frames(T_mount)
         reduced = reduce_poses(views.overlaps.gram, views.twists, hand_eye_frames, capture)
-        further = reduced.reduction @ twists
-        half = np.linalg.cholesky(pose_covariance(reduced, estimate_repeatability(reduced, further[:, free])))
-        columns = np.column_stack([reduced.hand_eye, further, reduced.z + further @ values])
-        stacked.append(np.linalg.solve(half, columns))
+        effects = reduced.reduction @ twists
+        covariance = pose_covariance(reduced, estimate_repeatability(reduced, effects[:, free]))
+        columns = np.column_stack([reduced.hand_eye, effects, reduced.z + effects @ values])
+        stacked.append(np.linalg.solve(np.linalg.cholesky(covariance), columns))
     white = np.concatenate(stacked)
     return WhitenedData(white[:, :6], white[:, 6:-1], white[:, -1])
 
 
 def capture_repeatability(capture: Capture, unconstrained: UnconstrainedPoses, T_mount: Array) -> Repeatability:
-    """Return the repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
+    """Return the scatter of one capture's poses by REML, the hand-eye being free; linearised at T_mount (4, 4)."""
     gram, twists = unconstrained.overlaps.gram, unconstrained.twists
     return estimate_repeatability(reduce_poses(gram, twists, capture.hand_eye_frames(T_mount), capture))

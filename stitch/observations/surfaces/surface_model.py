@@ -33,13 +33,13 @@ from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 from stitch.system.threads import remembered
 
-# Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
+# A parameter whose column, at its plausible size, is shorter than this many sigmas is left out of the mean.
 _UNSEEN = 0.25
 
 
 @dataclass(frozen=True)
 class SurfaceTrial:
-    """A linear trial of k parameters: twists of the views and sums over pairs, without new correspondences."""
+    """A trial of k parameters on overlapping surfaces: twists of the views, and sums over pairs without new matches."""
 
     linear: LinearModel
     unconstrained: UnconstrainedPoses
@@ -47,7 +47,7 @@ class SurfaceTrial:
     points: PointSums | None = None  # sums of the last parameters, if these move points within a view
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """Return coefficients (k,) by generalised least squares without some views."""
+        """Return the coefficients (k,) by generalised least squares, fitted without some views (indices)."""
         return self._solve(self._white_X, self.linear.white_z, left_out)
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
@@ -60,14 +60,14 @@ class SurfaceTrial:
         white, solutions = self._white_X, []
         for prior in priors:
             # A normal prior is k more observations of the coefficients.
-            half, k = np.sqrt(prior.precision), len(prior.precision)
-            z = np.append(self.linear.white_z, half * prior.mean)
-            solution = self._solve(np.vstack([white[:, :k], np.diag(half)]), z, left_out)
+            per_sigma, k = np.sqrt(prior.precision), len(prior.precision)
+            z = np.append(self.linear.white_z, per_sigma * prior.mean)
+            solution = self._solve(np.vstack([white[:, :k], np.diag(per_sigma)]), z, left_out)
             solutions.append(np.pad(solution, (0, white.shape[1] - k)))
         return solutions
 
     def _solve(self, white: Array, z: Array, left_out: Indices | None) -> Array:
-        """Return coefficients (k,) of whitened columns (n, k) for observations z (n,), without some views."""
+        """Return the coefficients (k,) of whitened columns (n, k) for observations z (n,), without some views."""
         k = white.shape[1]
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
@@ -76,51 +76,52 @@ class SurfaceTrial:
         return fit_columns(white, z)[:k]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """Return Σ w e² (pairs,) with the views where coefficients (k,) put them, for the present correspondences.
+        """Return Σ w e² (pairs,), length_unit², with the views where coefficients (k,) put them, without new matches.
 
         Args:
             units: pairs whose sums are returned; None: all.
         """
         g, points = self.unconstrained.overlaps.gram, self.points
-        of_points = points.residual.shape[1] if isinstance(points, PointGram) else 0
-        of_views = self.X.shape[1] - of_points
-        moved = (self.X[:, :of_views] @ coefficients[:of_views]).reshape(-1, 6) - self.unconstrained.twists
-        squares = pair_squares(g, moved)
+        of_views = self.X.shape[1] - (points.residual.shape[1] if isinstance(points, PointGram) else 0)
+        # The sums are at the free-network poses, which are `unconstrained.twists` away from the model's.
+        twists = (self.X[:, :of_views] @ coefficients[:of_views]).reshape(-1, 6) - self.unconstrained.twists
+        squares = pair_squares(g, twists)
         if isinstance(points, PointGram):
-            # Point effects change e itself and do not move the views.
+            # Effects that move points change e itself and do not move the views.
             theta = coefficients[of_views:]
-            difference = moved[g.pairs[:, 0]] - moved[g.pairs[:, 1]]
+            difference = twists[g.pairs[:, 0]] - twists[g.pairs[:, 1]]
             cross = np.einsum("pi,pik,k->p", difference, points.vector, theta)
             quadratic = np.einsum("k,pkl,l->p", theta, points.square, theta)
             squares = squares + 2 * points.residual @ theta + 2 * cross + quadratic
         return squares if units is None else squares[units]
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Return the sum of squares in the whitened directions that the left-out views alone move."""
+        """Return the χ² of the left-out views: squares of the whitened residual in the directions that these move."""
         directions = column_space(self._free(left_out))
         rest = self.linear.white_z - self._white((self.X @ coefficients)[:, None])[:, 0]
         return float(np.sum((directions.T @ rest) ** 2))
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """Return all views (V,)."""
+        """Return all views (V,): each has many correspondences, so that any may decide."""
         return np.arange(self.unconstrained.overlaps.gram.views, dtype=np.int64)
 
     @cached_property
     def _white_X(self) -> Array:
-        """(n, k)."""
+        """(n, k) the columns X, whitened."""
         return self._white(self.X)
 
     def _white(self, response: Array) -> Array:
+        """Return the whitened reduced columns (n, P) of twists (6V, P)."""
         return self.linear.whiten(self.linear.reduce(response))
 
     def _free(self, views: Indices) -> Array:
-        """Return whitened unit twists (n, 6k) of some views."""
+        """Return the whitened unit twists (n, 6k) of k views, which let these move freely."""
         return white_twists(self.linear)[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
 
 
 @dataclass(frozen=True)
 class SurfaceObservation(Observation):
-    """V free-network views; a response counts twists (6V, P), reduced to their n visible directions."""
+    """V free-network views: the observation's coordinates are twists (6V, P), reduced to their n visible directions."""
 
     capture: Capture  # without the effects in use
     unconstrained: UnconstrainedPoses
@@ -129,50 +130,50 @@ class SurfaceObservation(Observation):
 
     @property
     def reach(self) -> float:
-        """Rms lever of the correspondences about the centre."""
+        """Rms lever, length_unit, of the correspondences about the centre."""
         return self.unconstrained.overlaps.gram.lever
 
     def from_twists(self, moved: Array) -> Array:
-        """(n, P) visible directions of twists (6V, P): a response counts nothing else."""
+        """Return the visible directions (n, P) of twists (6V, P), which are the observation's own coordinates."""
         return self.reduce(moved)
 
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
-        """Twists (6V, P) of each term, and the sums of point effects."""
+        """Return per term the twists (6V, P) per unit of its parameters, and sums over pairs if it moves points."""
         return view_responses(measurement, model, terms, self.unconstrained)
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) visible directions of twists (6V, P)."""
+        """Return the visible directions (n, P) of twists (6V, P)."""
         return self.reduced_poses.reduction @ response
 
     def expand(self, columns: Array) -> Array:
-        """(6V, P) the shortest twists that make reduced observations (n, P)."""
+        """Return the shortest twists (6V, P) with the visible directions `columns` (n, P)."""
         return self.reduced_poses.expansion @ columns
 
     def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> SurfaceTrial:
-        """A model with the columns of twists (6V, k)."""
+        """Return the trial of a model with columns of twists `response` (6V, k); `points` are sums of the last."""
         return SurfaceTrial(linear, self.unconstrained, response, points)
 
     def affected_squares(self, views: Indices) -> Mask:
-        """(pairs,) with one of the views."""
+        """Return a mask (pairs,) of the pairs that one of the views is in."""
         mask: Mask = np.asarray(np.isin(self.unconstrained.overlaps.gram.pairs, views).any(axis=1))
         return mask
 
     def part_displacements(self, numbers: Array) -> Array:
-        """(V, 3) translations of the twists that make reduced observations (n,), less the common motion."""
+        """Return the translations (V, 3) of the shortest twists with visible directions (n,), less their mean."""
         out = self.expand(numbers).reshape(-1, 6)[:, 3:]
         return out - out.mean(axis=0)
 
 
 @remembered
 def white_twists(linear: LinearModel) -> Array:
-    """Return unit twists of all views (n, 6V) in units of the null's scatter."""
+    """Return the whitened unit twists (n, 6V) of all views of a linear model of surfaces; kept for the model."""
     surfaces = surfaces_of(linear)
     assert surfaces is not None
     return linear.whiten(surfaces.reduced_poses.reduction)
 
 
 def surfaces_of(linear: LinearModel) -> SurfaceObservation | None:
-    """Find the overlapping surfaces that a linear model is of; None where something else was observed."""
+    """Return the overlapping surfaces that a linear model is of; None where something else was observed."""
     return linear.observation if isinstance(linear.observation, SurfaceObservation) else None
 
 
@@ -199,6 +200,7 @@ def surface_model(
     reduced = reduce_poses(gram, unconstrained.twists, frames_of_mount, capture)
 
     def fit_null(mixed: MixedModel, names: Sequence[str] = ()) -> VarianceFit:
+        """Return the variances of a model, fitted, or those of planned views; `names` are its further components."""
         return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))
 
     # Which effects in use the views show at all, under scatter, noise and the scanner's own errors.
@@ -207,9 +209,9 @@ def surface_model(
     hand_eye_alone = replace(
         hand_eye_mixed_model(reduced), fixed=_scanner_covariance(measurement, unconstrained, reduced)
     )
-    half = np.linalg.cholesky(hand_eye_alone.covariance(fit_null(hand_eye_alone).variances)[0])
-    white_hand_eye = np.linalg.solve(half, reduced.hand_eye).astype(float)
-    white_effects = np.linalg.solve(half, reduced.reduction @ twists).astype(float)
+    root = np.linalg.cholesky(hand_eye_alone.covariance(fit_null(hand_eye_alone).variances)[0])
+    white_hand_eye = np.linalg.solve(root, reduced.hand_eye).astype(float)
+    white_effects = np.linalg.solve(root, reduced.reduction @ twists).astype(float)
     seen = independent(white_hand_eye, white_effects, sizes, _UNSEEN)
     mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=hand_eye_alone.fixed)
     errors = None
@@ -231,9 +233,9 @@ def surface_model(
 
 
 def _scanner_covariance(measurement: Measurement, unconstrained: UnconstrainedPoses, reduced: ReducedPoses) -> Array:
-    """Return the covariance (1, n, n) of the visible directions by the smooth errors that every scanner has.
+    """Return the covariance (1, n, n) of the reduced poses by the smooth errors that every scanner has.
 
-    Of several scanners also by errors of their scales.
+    With several scanners, by errors of their scales too.
     """
     errors = [field_scatter(measurement, unconstrained)]
     if measurement.views.scanners:
