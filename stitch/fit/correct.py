@@ -129,6 +129,7 @@ def correct(
         f.relative_to(c.poses(T_first)) if c.sightings is None else unconstrained_poses(c, c.poses(T_first), gate)
         for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
+    # Errors of several scanners do not weigh here: their places are fitted from this hand-eye on, and there they do.
     solved = solve_hand_eye(captures, unconstrained, T_first)
     require_near_scanner(captures, solved.T_mount)
 

@@ -8,7 +8,8 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.odometry import hand_eye_of_stream, is_stream
-from stitch.session.session import SessionData
+from stitch.session.session import Cloud, SessionData, View
+from stitch.session.thinning import thin_cloud
 
 # Fewer views say nothing of how the robot moved between them.
 _FEWEST = 4
@@ -44,12 +45,20 @@ def deskew_session(session: SessionData) -> SessionData:
         raise InputError(
             f"{where}: the scans show no hand-eye that says how the scanner moved; to fix: give scanner.pose"
         )
-    views = []
-    for v, view in enumerate(session.views):
-        assert view.cloud is not None
-        points = _seen_from_view(view.cloud.points, view.cloud.scalars["time"], path, path.times[v], T_mount)
-        views.append(replace(view, cloud=replace(view.cloud, points=points, normals=None, whole=None)))
-    return replace(session, views=tuple(views))
+
+    def of_view(view: View, time: float) -> View:
+        cloud = view.cloud
+        assert cloud is not None
+
+        def all_points() -> Cloud:
+            """Return the de-skewed cloud with the points that are not in memory too."""
+            whole = cloud if cloud.whole is None else cloud.whole.read()
+            points = _seen_from_view(whole.points, whole.scalars["time"], path, time, T_mount)
+            return replace(whole, points=points, normals=None)
+
+        return replace(view, cloud=thin_cloud(view.name, all_points(), len(cloud.points), session.scanner, all_points))
+
+    return replace(session, views=tuple(map(of_view, session.views, path.times)))
 
 
 def _mount_poses(session: SessionData) -> Array:

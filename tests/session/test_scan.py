@@ -24,6 +24,7 @@ from stitch.numerics.odometry import is_stream, motions_between, motions_of_stre
 from stitch.session import capture
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
+from stitch.session.reading import session_folder
 from stitch.session.reading.session_folder import load_session
 from stitch.session.scan import fit_planes, prepare_scan
 from stitch.session.session import Cloud, Scanner
@@ -206,6 +207,16 @@ def test_points_go_back_to_where_they_would_lie_had_the_scanner_stood(tmp_path):
         assert off(v, measured.clouds[v].points) > 0.4
         # Before the first view and after the last nothing says how the path goes on.
         assert off(v, session.views[v].cloud.points) < (0.1 if v in (0, 4) else 0.03)
+
+
+def test_points_that_memory_has_no_room_for_go_back_too_and_are_fused(tmp_path, monkeypatch):
+    write_session(tmp_path / "s", moving(5, noise=1e-6), "s")
+    all_points = [view.cloud.points for view in load_session(tmp_path / "s").views]
+    monkeypatch.setattr(session_folder, "points_within", lambda memory, views: 500)
+    for view, points in zip(load_session(tmp_path / "s", memory=2e9).views, all_points, strict=True):
+        assert len(view.cloud.points) == 500 and view.cloud.count == len(points)
+        np.testing.assert_allclose(view.cloud.whole.read().points, points, atol=1e-9)
+        assert np.array_equal(view.cloud.points, view.cloud.whole.scan.points)
 
 
 def test_odometry_follows_a_stream_and_separate_views_are_none():

@@ -16,6 +16,7 @@ from stitch.numerics.distributions import binomial_tail
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
+from stitch.output.mesh import spacing
 from stitch.run_data import RunData
 from stitch.system.open3d_library import import_open3d
 
@@ -127,10 +128,10 @@ def open3d_witness(run: RunData) -> Witness:
     clouds = [view.cloud.points for view in run.session.views if view.cloud is not None]
     if len(clouds) < len(run.session.views):
         raise NoResultError("--with open3d: labelled points are no clouds; there is nothing for Open3D to register")
-    clouds = [points[:: max(1, len(points) // _POINTS)] for points in clouds]
-    spacing = _spacing(clouds)
+    clouds = [np.ascontiguousarray(points[:: max(1, len(points) // _POINTS)], float) for points in clouds]
+    apart = float(np.median([spacing(points, KDTree(points)) for points in clouds]))
     with _one_thread(o3d):
-        poses, pairs = _registered(o3d, clouds, run.poses_model, spacing)
+        poses, pairs = _registered(o3d, clouds, run.poses_model, apart)
         normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
     poses = align_points(_placed(clouds, poses), _placed(clouds, run.poses)) @ poses
     difference = frames.inverse(run.poses) @ poses
@@ -150,7 +151,7 @@ def open3d_witness(run: RunData) -> Witness:
         to_run=_from_surface(placed[:: max(1, len(placed) // _ASKED)], fused, fused_normals),
         from_run=_from_surface(asked, placed, placed_normals),
         places=asked,
-        overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * spacing),
+        overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * apart),
     )
 
 
@@ -164,16 +165,6 @@ def _one_thread(o3d: Any) -> Iterator[None]:
             yield
     finally:
         limit(0)
-
-
-def _spacing(clouds: list[Array]) -> float:
-    """Return the mean spacing of the clouds' points, the edge s of the square of surface per point, in their unit.
-
-    The disc of radius r to the 8th neighbour holds 8 squares: s = r √(π/8).
-    """
-    rows = [np.ascontiguousarray(points, float) for points in clouds]
-    far = [np.median(KDTree(points).query(points[::20], k=9)[0][:, -1]) for points in rows]
-    return float(np.median(far) * np.sqrt(np.pi / 8))
 
 
 def _with_normals(o3d: Any, clouds: list[Array]) -> list[Any]:

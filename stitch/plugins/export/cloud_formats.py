@@ -64,8 +64,8 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
     return coloured(fused, unit, mesh if mesh.is_file() else None)
 
 
-def in_datum(cloud: ColouredCloud, folder: Path) -> ColouredCloud:
-    """Return the cloud of a run folder in the frame of the datum of its features.json.
+def stored_datum(folder: Path) -> Array:
+    """Return T_datum_reference (4, 4) of the features.json of a run folder, length_unit.
 
     Raises:
         InputError: no features were measured there in the frame of a datum.
@@ -77,6 +77,11 @@ def in_datum(cloud: ColouredCloud, folder: Path) -> ColouredCloud:
         T = np.zeros(0)
     if not frames.is_rigid(T):
         raise InputError(f"{file}: says no datum; to fix: run stitch measure with datum in FEATURES.toml first")
+    return T
+
+
+def in_datum(cloud: ColouredCloud, T: Array) -> ColouredCloud:
+    """Return a cloud of the reference frame in that of a datum, by T_datum_reference (4, 4), length_unit."""
     fused = replace(
         cloud.fused,
         points=frames.transform(T, cloud.fused.points),

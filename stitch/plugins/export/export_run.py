@@ -183,7 +183,7 @@ def _emit_files(to: str, output: Path | None, text: str | None = None) -> None:
 
 def _export_cloud(run: Path, to: str, output: Path | None, datum: bool) -> None:
     from stitch.numerics.units import MICROMETRES
-    from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured_cloud, in_datum
+    from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured_cloud, in_datum, stored_datum
     from stitch.system.files import whole_file
 
     if output is None or output.suffix.lower() != f".{to}":
@@ -191,7 +191,7 @@ def _export_cloud(run: Path, to: str, output: Path | None, datum: bool) -> None:
     write, lost = CLOUD_FORMATS[to]
     with show_activity("export: reading and writing the cloud"), whole_file(output) as file:
         cloud = coloured_cloud(run)
-        cloud = in_datum(cloud, run) if datum else cloud
+        cloud = in_datum(cloud, stored_datum(run)) if datum else cloud
         write(cloud, file)
     span = cloud.span * MICROMETRES[cloud.length_unit]
     colours = f"coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"

@@ -8,9 +8,10 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.errors import InputError, did_you_mean
 from stitch.output.diagnosis_document import diagnosis_document
 from stitch.output.result_document import model_of, result_document, scanner_documents
-from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
+from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured, in_datum
 from stitch.plugins.export.formats import Arm, Cloud, HandEye
 from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from, session_of_scanner
+from stitch.plugins.metrology.budget import MeasuredFeatures
 from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
 from stitch.run_data import RunData
 from stitch.system.files import whole_file
@@ -26,6 +27,7 @@ def export_run(
     scanner: str | None = None,
     with_effects: bool = False,
     diagnosis: Diagnosis | None = None,
+    datum: MeasuredFeatures | None = None,
 ) -> str | None:
     """Write what a run found for other programs, as `stitch export RUN --to` does.
 
@@ -37,14 +39,15 @@ def export_run(
         scanner: name of one of several, whose hand-eye it is.
         with_effects: the hand-eye that goes with the model's effects, not that at their mean over the views.
         diagnosis: of the run; what is written says what it found.
+        datum: features that `stitch.measure` found in the frame of a datum, in which a cloud is then written.
 
     Returns:
         The text, of T_parent_child (4, 4) in the unit that it states, U beside it; None of a cloud, which is written in
-        the reference frame.
+        the reference frame, or in that of the datum.
 
     Raises:
-        InputError: a format that is not known, no file for a cloud, a run that has no such thing, or several scanners
-            of which none is named.
+        InputError: a format that is not known, no file for a cloud, a run that has no such thing, several scanners of
+            which none is named, or features without a datum.
 
     Example:
         >>> "T_flange_scanner" in stitch.export_run(run, "ros")
@@ -52,14 +55,21 @@ def export_run(
         >>> stitch.export_run(run, "ply", folder / "cloud.ply")
     """
     path = None if file is None else Path(file)
+    if datum is not None and to not in CLOUD_FORMATS:
+        raise InputError(f"datum: is of a cloud; to fix: name one of {', '.join(CLOUD_FORMATS)}")
     if to in CLOUD_FORMATS:
         if path is None or path.suffix.lower() != f".{to}":
             raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
         if not len(run.fused.points):
             raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
         write, _ = CLOUD_FORMATS[to]
+        cloud = coloured(stored_cloud(run), run.session.length_unit)
+        if datum is not None:
+            if datum.T_datum_reference is None:
+                raise InputError("datum: these were measured without one; to fix: state datum in FEATURES.toml")
+            cloud = in_datum(cloud, datum.T_datum_reference)
         with whole_file(path) as out:
-            write(coloured(stored_cloud(run), run.session.length_unit), out)
+            write(cloud, out)
         return None
     if to in ARM_FORMATS:
         session = run.measured if isinstance(run, Run) and run.measured is not None else run.session

@@ -82,7 +82,7 @@ def load_session(
     rows = [row for row in rows if only is None or row.view.name == only]
     cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
-    # Scans of a moving scanner are corrected point by point: the file does not hold what would be read again.
+    # How a moving scanner moved is found from all points of its scans, where there is room for them.
     at_most = None if scanner.moving else at_most
     if memory is not None:
         at_most = min(at_most or MAX_POINTS, points_within(memory, len(rows)))

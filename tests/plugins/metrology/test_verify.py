@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ import tomli_w
 from plyfile import PlyData
 from typer.testing import CliRunner
 
+import stitch
 from data_synth.cells.verified_cell import write_verified_cell
 from stitch.cli.main import build
 from stitch.errors import InputError
+from stitch.numerics import frames
 from stitch.plugins.metrology import verb
 from stitch.plugins.metrology.budget import MeasuredFeatures, Number
 from stitch.plugins.metrology.feature_file import read_features
@@ -22,6 +25,7 @@ from stitch.plugins.metrology.features import Feature
 from stitch.plugins.metrology.planning.command import place_of
 from stitch.plugins.metrology.verification import largest_E_n, verify
 from stitch.run_data import HandEyeTransfer
+from stitch.session.reading.clouds import read_cloud
 from tests.in_browser import WAYS, require_for_everybody
 from viz.features_page import write_certificate, write_features
 
@@ -52,9 +56,10 @@ def worked_out_once():
         return stitched[key]
 
     def place_once(state):
-        if id(state) not in placed:
-            placed[id(state)] = (state, place_errors(state))
-        return placed[id(state)][1]
+        key = (state.session.path, state.T_mount.tobytes(), state.mount_covariance.tobytes())
+        if key not in placed:
+            placed[key] = place_errors(state)
+        return placed[key]
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(verb, "stitch_session", stitch_once)
@@ -93,6 +98,31 @@ def test_measure_without_features_gives_every_point_a_sigma(cell):
     assert _stitch("measure", cell / "run").exit_code == 0
     sigma = PlyData.read(cell / "run" / "stitched.ply")["vertex"]["sigma"]
     assert np.isfinite(sigma).all() and 0.001 < np.median(sigma) < 0.2
+
+
+def test_numbers_and_cloud_count_in_the_frame_of_a_datum_by_command_and_in_python(cell):
+    part, artefact = (tomllib.loads((cell / name).read_text()) for name in ("part.toml", "artefact/artefact.toml"))
+    datum = ["top.offset", "top.slope_u", "top.slope_v", "ball 1.x", "ball 1.y", "ball 2.y"]
+    seen = [part["feature"][-1], *(row for row in artefact["feature"] if row["kind"] == "sphere")]
+    (cell / "datum.toml").write_text(tomli_w.dumps(part | {"datum": datum, "feature": seen}))
+    done = _stitch("measure", cell / "run", cell / "datum.toml")
+    assert "Numbers count in the frame of the datum" in done.output
+    document = json.loads((cell / "run" / "features.json").read_text())
+    held = [n for n in document["numbers"] if f"{n['feature']}.{n['quantity']}" in datum]
+    assert len(held) == 6 and all(abs(n["value"] - n["nominal"]) < 1e-6 and n["U"] == 0 for n in held)
+    run = stitch.load_run(cell / "run")
+    measured = stitch.measure(run, cell / "datum.toml")
+    assert np.array_equal(measured.T_datum_reference, document["T_datum_reference"])
+    _stitch("export", cell / "run", "--to", "ply", "--datum", "-o", cell / "a.ply")
+    stitch.export_run(run, "ply", cell / "b.ply", datum=measured)
+    points = read_cloud(cell / "b.ply").points
+    assert np.array_equal(points, read_cloud(cell / "a.ply").points)
+    expected = frames.transform(measured.T_datum_reference, run.fused.points)
+    assert np.allclose(points, expected, atol=1e-3) and not np.allclose(points, run.fused.points, atol=5e-3)
+    with pytest.raises(InputError, match="datum: is of a cloud; to fix"):
+        stitch.export_run(run, "ros", datum=measured)
+    with pytest.raises(InputError, match="measured without one; to fix: state datum"):
+        stitch.export_run(run, "ply", cell / "b.ply", datum=replace(measured, T_datum_reference=None))
 
 
 def _artefact(cell, name, limit, factor=1.0, first_by=0.0):
