@@ -300,7 +300,8 @@ def summary(rows: list[Row]) -> list[str]:
     for crash in (crash for row in rows for crash in row["crashes"]):
         place = crash.rsplit(": ", 1)[0] if crash.count(": ") > 1 else crash
         places[place] = places.get(place, 0) + 1
-    return [*table, *(f"{count} × {place}" for place, count in sorted(places.items(), key=lambda item: -item[1]))]
+    told = [f"- {count} × {place}" for place, count in sorted(places.items(), key=lambda item: -item[1])]
+    return [*table, "", *told] if told else table
 
 
 TABLE = harness.Table(jobs, trial, summary, range(20_000, 22_000), page="limits", block="degenerate")

@@ -192,9 +192,12 @@ def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
     Only combinations that are new beside the model are added: the others would make it singular.
     """
     white = linear.residual(columns)
-    length = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
+    length = np.linalg.norm(white, axis=0)
+    # What rounding leaves of a column that the model has already would be blown up beyond all numbers.
+    new = length > _NOTHING
+    columns, white, length = columns[:, new], white[:, new], length[new]
     _, s, turned = np.linalg.svd(white / length, full_matrices=False)
-    keep = s > _NEW_SHARE * s[0]
+    keep = s > _NEW_SHARE * s.max(initial=0.0)
     combined = (columns / length) @ (turned[keep].T / s[keep])
     return linear.conditioned_on(combined, np.full(int(keep.sum()), np.inf))
 

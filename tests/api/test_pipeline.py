@@ -275,7 +275,7 @@ def test_what_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(kind, vie
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [20286, 20421, 21224])
+@pytest.mark.parametrize("seed", [20286, 20421, 21224, 21798])
 def test_a_draw_that_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(seed):
     outcome = degenerate.trial(degenerate.jobs([seed])[0])
     assert outcome["crashes"] == [] and (outcome["result"] or outcome["refused"])
