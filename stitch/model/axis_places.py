@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch.effects.axis_effects import PLACEMENT
-from stitch.model.forward import chain_errors
+from stitch.model.forward import true_chain
 from stitch.model.model import Model, Term, values_of
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -125,7 +125,7 @@ def _as_stated(measurement: Measurement, model: Model, term: Term | None, k: int
         near: (3,) same frame; the point returned is the one on the axis that is nearest to it.
     """
     axes = measurement.views.axes
-    motion = axes.as_read() if term is None else chain_errors(measurement, [term]).axes
+    motion = axes.as_read() if term is None else true_chain(measurement, [term]).axes
     assert motion is not None
     axis = axes.placed(motion)[k]
     assert axis.direction is not None

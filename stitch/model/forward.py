@@ -16,18 +16,18 @@ from stitch.model.model import ARM_PLACES, Model, Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.session.axes import AxisMotion
-from stitch.session.capture import Capture
+from stitch.session.capture import Capture, Sightings
 from stitch.session.measurement import Measurement, ScanView
 from stitch.session.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
 
-# Step as a share of the plausible size: errors of third order stay far below the noise. A time constant is stepped
-# less, since the effect is not linear in it.
+# Steps of central differences, as shares of a parameter's plausible size: errors of third order stay far below the
+# noise. A parameter with a grid, as a time constant, is stepped less, since the effect is not linear in it.
 STEP, _STEP_GRIDDED = 0.1, 0.005
 
 
 @dataclass(frozen=True)
-class ChainErrors:
-    """The true chain of frames of V views, with all that effects of base, robot, links, mount, part and axes change."""
+class TrueChain:
+    """The true chain of frames of V views: what effects of base, robot, links, mount, part and axes make of it."""
 
     joints: Array  # (V, n) rad, the true angles
     links: Links  # the true ones
@@ -37,8 +37,8 @@ class ChainErrors:
     axes: AxisMotion | None = None  # of the external axes, as they truly move
 
 
-def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
-    """Return the true chain of frames of all views under effects: joints, links, and twists of mount, part and base.
+def true_chain(measurement: Measurement, terms: Sequence[Term], base: TrueChain | None = None) -> TrueChain:
+    """Return the true chain of frames of all views under effects.
 
     Args:
         terms: effects with their values, applied in this order.
@@ -49,27 +49,26 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
         exact = exact_links(*views.joints.shape)
         axes = views.axes.as_read() if views.axes else None
         none = np.zeros((views.count, 6))
-        base = ChainErrors(views.joints, exact, none, none, none, axes)
-    joints, mount, part, axes = base.joints, base.mount, base.part, base.axes
-    tilt = base.base
-    # A user's own effect may change the links that it is given in place.
+        base = TrueChain(views.joints, exact, none, none, none, axes)
+    # Copied, since a user's own effect may change the links that it is given.
     links = Links(*(value.copy() for value in vars(base.links).values()))
+    chain = replace(base, links=links)
     for term in terms:
         function, arguments = term.effect.function, term.arguments
         # The function adds to what it is given; what it reads of the pose are the reported angles.
         if term.effect.place == "robot":
-            joints = function(joints, views, **arguments)
+            chain = replace(chain, joints=function(chain.joints, views, **arguments))
         elif term.effect.place == "links":
-            links = function(links, views, **arguments)
+            chain = replace(chain, links=function(chain.links, views, **arguments))
         elif term.effect.place == "mount":
-            mount = mount + function(views, **arguments)
+            chain = replace(chain, mount=chain.mount + function(views, **arguments))
         elif term.effect.place == "part":
-            part = part + function(views, **arguments)
+            chain = replace(chain, part=chain.part + function(views, **arguments))
         elif term.effect.place == "base":
-            tilt = tilt + function(views, **arguments)
+            chain = replace(chain, base=chain.base + function(views, **arguments))
         elif term.effect.place == "axis":
-            axes = function(axes, views, **arguments)
-    return ChainErrors(joints, links, mount, part, tilt, axes)
+            chain = replace(chain, axes=function(chain.axes, views, **arguments))
+    return chain
 
 
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
@@ -78,19 +77,18 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
     L is exp(−part) · T_reference_mount with the true arm and axes; R is exp(mount), behind the place of the view's
     scanner if there are several.
     """
-    errors = chain_errors(measurement, terms)
+    chain = true_chain(measurement, terms)
     T_base_flange = measurement.T_base_flange
     if any(term.effect.place in ARM_PLACES for term in terms):
-        # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
-        under, true = _under_base(measurement), T_base_flange
+        true_arm = T_base_flange
         if measurement.robot is not None and measurement.views.has("joints"):
-            true = forward_with_errors(measurement.robot, errors.joints, errors.links)
-        T_base_flange = under @ frames.exp(errors.base) @ true
-    if errors.axes is not None and any(term.effect.place == "axis" for term in terms):
-        T_base_flange = measurement.views.axes.correction(errors.axes) @ T_base_flange
+            true_arm = forward_with_errors(measurement.robot, chain.joints, chain.links)
+        T_base_flange = _under_base(measurement) @ frames.exp(chain.base) @ true_arm
+    if chain.axes is not None and any(term.effect.place == "axis" for term in terms):
+        T_base_flange = measurement.views.axes.correction(chain.axes) @ T_base_flange
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
-    right, behind = frames.exp(errors.mount), measurement.views.scanners.behind
-    return frames.exp(-errors.part) @ left, right if behind is None else behind @ right
+    right, behind = frames.exp(chain.mount), measurement.views.scanners.behind
+    return frames.exp(-chain.part) @ left, right if behind is None else behind @ right
 
 
 def _under_base(measurement: Measurement) -> Array:
@@ -137,9 +135,9 @@ def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose:
     """
     true = points
     for term in (t for t in terms if t.effect.place == "sensor"):
-        arguments, reported = term.arguments, true
+        reported = true
         for _ in range(steps):
-            true = reported - (term.effect.function(true, view, **arguments) - true)
+            true = reported - (term.effect.function(true, view, **term.arguments) - true)
     for term in (t for t in terms if t.effect.place == "shape"):
         in_reference = frames.transform(pose, true)
         moved = term.effect.function(in_reference, view, **term.arguments) - in_reference
@@ -163,11 +161,12 @@ def target_correction(
     if not moves_points(terms):
         return np.zeros(sightings.points.shape)
     places = target_places(measurement, terms, poses) if places is None else places
-    to_sensor = frames.inverse(poses)
-    shown = frames.transform(to_sensor, places)
-    grown = _displaced("shape", terms, measurement.target_views, places)
-    points = shown.copy() if grown is places else frames.transform(to_sensor, grown)
-    correction = shown - _displaced("sensor", terms, measurement.target_views, points)
+    T_scanner_reference = frames.inverse(poses)
+    true = frames.transform(T_scanner_reference, places)
+    # What the sensor reports of the same places: the part has another shape, then the sensor is off.
+    reshaped = _displaced("shape", terms, measurement.target_views, places)
+    seen = true.copy() if reshaped is places else frames.transform(T_scanner_reference, reshaped)
+    correction = true - _displaced("sensor", terms, measurement.target_views, seen)
     return np.where((sightings.target >= 0)[..., None], correction, 0.0)
 
 
@@ -181,38 +180,46 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
         poses: (V, 4, 4) T_reference_scanner.
         steps: of the fixed point between positions and corrections, where effects move points.
     """
-    s = measurement.capture.sightings
-    assert s is not None
-    placed = frames.transform(poses, s.points)
-    used = s.used
-    blank = s.target.max(axis=1) < 0
-    count = np.maximum(s.view_counts, 1)[:, None]
-    # An empty slot borrows the first target of its view, a view without any the first of all: its own zero has no ray.
-    first = np.maximum(s.target.max(axis=1), 0)
-    slots = np.where(s.target >= 0, s.target, first[:, None])
-
-    def mean(points: Array) -> Array:
-        """Return per slot (V, S, 3) the mean over views of its target's points; an unused target stays where it is."""
-        sums = np.zeros((len(s.targets), 3))
-        np.add.at(sums, s.target[used], points[used])
-        out = np.where((s.view_counts[slots] > 0)[..., None], (sums / count)[slots], points)
-        return np.where(blank[:, None, None], points[used].mean(axis=0), out)
-
-    places = mean(placed)
+    sightings = measurement.capture.sightings
+    assert sightings is not None
+    measured = frames.transform(poses, sightings.points)
+    places = _mean_places(sightings, measured)
     for _ in range(steps if moves_points(terms) else 0):
         correction = target_correction(measurement, terms, poses, places)
-        places = mean(placed + frames.rotate(poses, correction))
+        places = _mean_places(sightings, measured + frames.rotate(poses, correction))
     return places
 
 
-def _displaced(place: str, terms: Sequence[Term], views: Sequence[ScanView], points: Array) -> Array:
-    """Return true points (V, N, 3) of all views as displaced by the effects of one place, the last effect first.
+def _mean_places(s: Sightings, points: Array) -> Array:
+    """Return per slot (V, S, 3) the mean over the views of the points of its target; one that no view uses stays.
 
-    The reverse of the order in which `point_correction` undoes them.
+    An empty slot, whose zero is no place with a ray to it, gets that of a target of its view; in a view without targets
+    the mean of all points.
+
+    Args:
+        points: (V, S, 3) reference frame.
+    """
+    sums = np.zeros((len(s.targets), 3))
+    np.add.at(sums, s.target[s.used], points[s.used])
+    means = sums / np.maximum(s.view_counts, 1)[:, None]
+    any_of_view = s.target.max(axis=1)
+    target = np.where(s.target >= 0, s.target, np.maximum(any_of_view, 0)[:, None])
+    places = np.where((s.view_counts[target] > 0)[..., None], means[target], points)
+    return np.where((any_of_view < 0)[:, None, None], points[s.used].mean(axis=0), places)
+
+
+def _displaced(place: str, terms: Sequence[Term], views: Sequence[ScanView], points: Array) -> Array:
+    """Return the true points (V, N, 3) of all views as displaced by the effects that act at one place.
+
+    The last effect comes first: the reverse of the order in which `point_correction` undoes them.
+
+    Args:
+        place: where in the chain the effects act, "sensor" or "shape".
+        points: in the frame of that place: the scanner's, or the reference frame.
     """
     for term in (t for t in reversed(terms) if t.effect.place == place):
         displace = partial(term.effect.function, **term.arguments)
-        points = np.array([displace(of_view, view) for of_view, view in zip(points, views, strict=True)])
+        points = np.array([displace(points_of_view, view) for points_of_view, view in zip(points, views, strict=True)])
     return points
 
 
@@ -263,21 +270,22 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
         centre: (3,) reference frame.
     """
     # One Jacobian of the chain serves all terms that leave the chain at the same errors.
-    chain = None
-    in_use = chain_errors(measurement, model.terms)
+    jacobian = None
+    in_use = true_chain(measurement, model.terms)
     for term in terms:
+        # The chain under all other effects, which the term's own are added to.
         others = in_use
         if any(used.name == term.name for used in model.terms):
-            others = chain_errors(measurement, model.without(term.name).terms)
-        errors = chain_errors(measurement, [term], others)
-        if chain is None or not chain.is_about(errors):
-            chain = _ChainJacobian(measurement, model.with_term(term), errors, frames.make(np.eye(3), -centre))
+            others = true_chain(measurement, model.without(term.name).terms)
+        chain = true_chain(measurement, [term], others)
+        if jacobian is None or not jacobian.is_about(chain):
+            jacobian = _ChainJacobian(measurement, model.with_term(term), chain, frames.make(np.eye(3), -centre))
         derivatives = np.zeros((len(term.parameters), measurement.views.count, 6))
         sizes = [(_STEP_GRIDDED if p.grid else STEP) * p.typical for p in term.parameters]
         fitted = [i for i, p in enumerate(term.parameters) if not p.discrete]
-        steps = [[chain_errors(measurement, [moved], others) for moved in _stepped(term, i, sizes[i])] for i in fitted]
+        steps = [[true_chain(measurement, [moved], others) for moved in _stepped(term, i, sizes[i])] for i in fitted]
         if steps:
-            twists = chain.twists(steps, term.effect.place)
+            twists = jacobian.twists(steps, term.effect.place)
             derivatives[fitted] = twists / (2 * np.array(sizes)[fitted, None, None])
         yield derivatives
 
@@ -291,19 +299,19 @@ class _ChainJacobian:
 
     measurement: Measurement
     about: Model
-    errors: ChainErrors  # the chain under that model
+    chain: TrueChain  # under that model
     to_centre: Array  # (4, 4) translation of the reference frame's origin to the centre
 
-    def is_about(self, errors: ChainErrors) -> bool:
-        """Return True if a chain equals this one up to rounding, as of the same effects summed in another order."""
+    def is_about(self, chain: TrueChain) -> bool:
+        """Return True if `chain` equals this one up to rounding, as that of the same effects added in another order."""
         arrays, others = (
             (e.joints, *vars(e.links).values(), e.mount, e.part, e.base, *(vars(e.axes).values() if e.axes else ()))
-            for e in (self.errors, errors)
+            for e in (self.chain, chain)
         )
         pairs = zip(arrays, others, strict=True)
         return all(np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in pairs)
 
-    def twists(self, steps: Sequence[Sequence[ChainErrors]], place: str) -> Array:
+    def twists(self, steps: Sequence[Sequence[TrueChain]], place: str) -> Array:
         """Return twists (P, V, 6) of the views from the second chain of each pair to the first.
 
         Args:
@@ -331,44 +339,44 @@ class _ChainJacobian:
     def flange(self) -> FlangeSlopes:
         """Derivatives of the flange's pose by joints and links, twists in the flange frame."""
         assert self.measurement.robot is not None
-        return flange_slopes(self.measurement.robot, self.errors.joints, self.errors.links)
+        return flange_slopes(self.measurement.robot, self.chain.joints, self.chain.links)
 
     @cached_property
     def of_flange(self) -> Array:
         """(V, 6, 6) maps twists in the flange frame, T_base_flange·exp(ξ), to twists of the views about the centre."""
         if self.measurement.eye_to_hand:
             # The flange is the reference frame, and its pose is inverted: (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹.
-            return -frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
+            return -frames.adjoint(self.to_centre @ frames.exp(-self.chain.part))
         return frames.adjoint(self._left)
 
     @cached_property
     def of_base(self) -> Array:
         """(V, 6, 6) maps changes of the base's twist to twists of the views; axes may carry the base."""
         under = frames.adjoint(_under_base(self.measurement))
-        return self.of_axes @ under @ frames.left_jacobian(self.errors.base)
+        return self.of_axes @ under @ frames.left_jacobian(self.chain.base)
 
     @cached_property
     def of_axes(self) -> Array:
         """(V, 6, 6) maps twists ξ of the flange's effective pose, exp(ξ)·T_base_flange, to those of the views."""
         if self.measurement.eye_to_hand:
             return -frames.adjoint(self._left)
-        return frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
+        return frames.adjoint(self.to_centre @ frames.exp(-self.chain.part))
 
     @cached_property
     def of_mount(self) -> Array:
         """(V, 6, 6) maps changes δ of the mount's twist m to twists of the views: exp(m + δ) ≈ exp(J δ)·exp(m)."""
         behind = self.measurement.views.scanners.behind
         T_mount = self.about.T_mount if behind is None else self.about.T_mount @ behind
-        return frames.adjoint(self._left @ T_mount) @ frames.left_jacobian(self.errors.mount)
+        return frames.adjoint(self._left @ T_mount) @ frames.left_jacobian(self.chain.mount)
 
     @cached_property
     def of_part(self) -> Array:
         """(V, 6, 6) maps changes of the part's twist to twists of the views."""
-        return -(frames.adjoint(self.to_centre) @ frames.left_jacobian(-self.errors.part))
+        return -(frames.adjoint(self.to_centre) @ frames.left_jacobian(-self.chain.part))
 
     @cached_property
     def _left(self) -> Array:
-        """T_centre_mount (V, 4, 4): all to the left of the hand-eye, the reference frame's origin at the centre."""
+        """(V, 4, 4) T_centre_mount: all that stands left of the hand-eye, seen from the centre."""
         return self.to_centre @ perturbed_frames(self.measurement, self.about.terms)[0]
 
 
@@ -395,7 +403,7 @@ class PointSlopes:
             pose: (4, 4) T_reference_scanner of the view.
         """
         points, view = scan_points(self.measurement, v, index)
-        return self._of_terms(
+        return self._slopes(
             lambda terms: point_correction(terms, points, view, pose, steps=1),
             lambda per_unit: -per_unit(points, view),
         )
@@ -409,38 +417,47 @@ class PointSlopes:
         sightings, views = self.measurement.capture.sightings, self.measurement.target_views
         assert sightings is not None
         places = target_places(self.measurement, () if self.model is None else self.model.terms, poses)
-        shown = frames.transform(frames.inverse(poses), places)
+        in_scanner = frames.transform(frames.inverse(poses), places)
 
-        def undone(per_unit: Callable[..., Array]) -> Array:
+        def exact_slopes(per_unit: Callable[..., Array]) -> Array:
             """Return (P, V, S, 3) what undoes a unit of each parameter of an effect; zero in empty slots."""
-            moved = np.array([per_unit(points, view) for points, view in zip(shown, views, strict=True)])
+            moved = np.array([per_unit(points, view) for points, view in zip(in_scanner, views, strict=True)])
             return np.where((sightings.target >= 0)[..., None], -moved.swapaxes(0, 1), 0.0)
 
-        return self._of_terms(lambda terms: target_correction(self.measurement, terms, poses, places), undone)
+        return self._slopes(lambda terms: target_correction(self.measurement, terms, poses, places), exact_slopes)
 
-    def _of_terms(
-        self, correction: Callable[[Sequence[Term]], Array], undone: Callable[[Callable[..., Array]], Array]
+    def _slopes(
+        self, correction: Callable[[Sequence[Term]], Array], exact_slopes: Callable[[Callable[..., Array]], Array]
     ) -> Array:
-        """Return the slopes of what must be added to undo terms; `undone` gives it where an effect says its own."""
+        """Return the derivatives (P, …, 3) of a correction by the parameters of all terms.
+
+        Args:
+            correction: called with effects; returns the vectors (…, 3) that undo them.
+            exact_slopes: called with an effect's `per_unit`; returns the derivatives (p, …, 3) by its p parameters.
+        """
         slopes = [correction(())[None][:0]]
         for term, steps in zip(self.terms, self._steps, strict=True):
             per_unit = term.effect.per_unit
-            if per_unit is not None and not steps:
-                slopes.append(undone(per_unit))
-            slopes += [((correction(up) - correction(down)) / width)[None] for up, down, width in steps]
+            if steps is not None:
+                slopes += [((correction(up) - correction(down)) / width)[None] for up, down, width in steps]
+            elif per_unit is not None:
+                slopes.append(exact_slopes(per_unit))
         return np.concatenate(slopes)
 
     @cached_property
-    def _steps(self) -> list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]]]:
-        """Per term the effects of the model with one parameter larger and smaller, and how far these are apart; none of
-        an effect that says by itself what its parameters do, and is alone among effects of points."""
-        steps = list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]]]()
+    def _steps(self) -> list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]] | None]:
+        """Per term the steps of central differences, one a parameter; None where the derivatives are known exactly.
+
+        A step is the effects of the model with the parameter larger, those with it smaller, and the difference of the
+        two values. Exact are those of an effect with `per_unit` that is alone among the effects that move points.
+        """
+        steps = list[list[tuple[tuple[Term, ...], tuple[Term, ...], float]] | None]()
         for term in self.terms:
             assert self.model is not None
             if term.effect.per_unit is not None and not moves_points(self.model.without(term.name).terms):
-                steps.append([])
+                steps.append(None)
                 continue
-            # The view of an event is tried, never fitted: nothing answers to it.
+            # The view of an event is tried, never fitted: a step of zero width has the derivative 0.
             sizes = [0.0 if parameter.discrete else STEP * parameter.typical for parameter in term.parameters]
             stepped = (map(self.model.with_term, _stepped(term, i, size)) for i, size in enumerate(sizes))
             steps.append(

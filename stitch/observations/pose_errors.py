@@ -124,40 +124,40 @@ def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -
 
 
 def usual_twist(length_unit: str) -> Array:
-    """(6,) how much a flange usually turns (rad) and moves."""
+    """Return how much a flange usually turns and moves in one view, (6,): rad before length_unit."""
     return np.repeat([_ROTATION, _TRANSLATION * _PER_MM[length_unit]], 3)
 
 
 def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
-    """Return left twists (6V, 6) of all views of a rig by usual rotations and translations of the flange.
+    """Return left twists (6V, 6) of all views of a rig for usual rotations and translations of the flange.
 
     The columns are rotations about, then translations along, the flange's own x, y and z: sizes as in `usual_twist`.
 
     Args:
-        centres: per session the point (3,) about which twists count, reference frame.
+        centres: per session the point (3,) about which the twists turn, reference frame.
     """
-    unit = usual_twist(measurements[0].length_unit)
-    carried = [
+    adjoints = [
         frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
         for m, centre in zip(measurements, centres, strict=True)
     ]
-    return np.concatenate(carried).reshape(-1, 6) * unit
+    return np.concatenate(adjoints).reshape(-1, 6) * usual_twist(measurements[0].length_unit)
 
 
 def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
-    """Return the variances (2,), rad² and length_unit², per axis of the flange's rotation and translation by n errors.
+    """Return the variances (2,) of the flange's rotation (rad²) and translation (length_unit²) by n independent errors.
 
-    They are means over the views and the three axes of the flange.
+    They are per axis of the flange: means over the views and the three axes.
 
     Args:
-        columns: (6V, n) left twists of the views per unit of each error; the errors are independent, of unit variance.
-        centres: per session the point (3,) about which they count, reference frame.
+        columns: (6V, n) left twists of the views for one sigma of each error.
+        centres: per session the point (3,) about which these twists turn, reference frame.
     """
-    flange = flange_twists(measurements, centres).reshape(-1, 6, 6)
-    unit = usual_twist(measurements[0].length_unit)
-    twists = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
-    squares = (twists**2).sum(axis=2).mean(axis=0)
-    return squares.reshape(2, 3).mean(axis=1)
+    per_usual_twist = flange_twists(measurements, centres).reshape(-1, 6, 6)
+    # Twists of the flange in its own frame (V, 6, n): in multiples of the usual twist, then in rad and length_unit.
+    of_flange = np.linalg.solve(per_usual_twist, columns.reshape(len(per_usual_twist), 6, -1))
+    of_flange *= usual_twist(measurements[0].length_unit)[:, None]
+    variances = (of_flange**2).sum(axis=2).mean(axis=0)
+    return variances.reshape(2, 3).mean(axis=1)
 
 
 def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
@@ -166,23 +166,18 @@ def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
     Args:
         memory: correlation time, in median steps from one view to the next.
     """
-    counts = [m.views.count for m in measurements]
-    out, at = np.zeros((sum(counts), sum(counts))), 0
-    for m, count in zip(measurements, counts, strict=True):
-        time = time_in_steps(m)
-        out[at : at + count, at : at + count] = exponential_kernel(time, time, memory)
-        at += count
-    return out
+    times = [time_in_steps(m) for m in measurements]
+    return block_diag(*(exponential_kernel(time, time, memory) for time in times))
 
 
 def time_in_steps(measurement: Measurement) -> Array:
-    """(V,) times of the views in usual steps from one to the next; their numbers where no time is stated."""
+    """Return the times (V,) of the views in median steps from view to view; their order where no time is stated."""
     views, step = measurement.views, usual_time_step(measurement)
     return views.time / step if step > 0 else np.arange(views.count, dtype=float)
 
 
 def usual_time_step(measurement: Measurement) -> float:
-    """From one view to the next, s; 0 where no time is stated."""
+    """Return the median time from one view to the next, s; 0 where no time is stated."""
     steps = np.diff(measurement.views.time)
     return float(np.median(steps)) if measurement.views.has("time") and (steps > 0).any() else 0.0
 
@@ -200,24 +195,24 @@ def joint_processes(
         offsets: (6V, n) left twists of the views per unit of each joint's error.
         joint_kernel: (V, V) correlations of a smooth function of all joint angles.
     """
-    # From the joints of the view before: the direction in which a joint came.
-    came = joints - np.concatenate([m.views.previous for m in measurements])
-    slowly = drift_kernel(measurements, DRIFT_MEMORY["slowly wandering"])
-    every = tuple(range(joints.shape[1]))
-    kinds = {ALL_ANGLES: joint_kernel, WITH_TIME: (1 + joint_kernel) / 2 * slowly, TIME_ONLY: slowly}
-    processes = {kind: SmoothErrors(offsets, kernel, every) for kind, kernel in kinds.items()}
+    # By how much each joint turned from the view before: its sign is the direction in which it came.
+    travel = joints - np.concatenate([m.views.previous for m in measurements])
+    drift = drift_kernel(measurements, DRIFT_MEMORY["slowly wandering"])
+    all_joints = tuple(range(joints.shape[1]))
+    common_kernels = {ALL_ANGLES: joint_kernel, WITH_TIME: (1 + joint_kernel) / 2 * drift, TIME_ONLY: drift}
+    processes = {name: SmoothErrors(offsets, kernel, all_joints) for name, kernel in common_kernels.items()}
     moving = tuple(map(int, np.flatnonzero(np.ptp(joints, axis=0) > _STATIONARY_RANGE)))
     if moving:
-        closely = np.array([short_range_kernel(joints[:, k], joints[:, k]) for k in moving])
-        in_way = np.array([direction_kernel(joints[:, k], came[:, k]) for k in moving])
-        processes[OWN_ANGLE] = SmoothErrors(offsets[:, moving], closely, moving)
-        processes[TRAVEL] = SmoothErrors(offsets[:, moving], in_way, moving)
+        of_angle = np.array([short_range_kernel(joints[:, k], joints[:, k]) for k in moving])
+        of_direction = np.array([direction_kernel(joints[:, k], travel[:, k]) for k in moving])
+        processes[OWN_ANGLE] = SmoothErrors(offsets[:, moving], of_angle, moving)
+        processes[TRAVEL] = SmoothErrors(offsets[:, moving], of_direction, moving)
     # Joints drag each other. A function of two angles has few degrees of freedom, one of all angles too many for few
     # views.
-    pairs = [two for two in permutations(every, 2) if set(two) & set(moving)]
+    pairs = [(k, other) for k, other in permutations(all_joints, 2) if k in moving or other in moving]
     if pairs:
         first, second = (tuple(column) for column in zip(*pairs, strict=True))
-        kernels = np.array([two_joint_kernel(*joints.T[[*two]]) for two in pairs])
+        kernels = np.array([two_joint_kernel(joints[:, k], joints[:, other]) for k, other in pairs])
         processes[TWO_ANGLES] = SmoothErrors(offsets[:, first], kernels, first, second)
     return processes | _periodic_processes(joints, offsets) | _load_processes(measurements, offsets)
 
@@ -282,13 +277,17 @@ def usual_sizes() -> dict[str, float]:
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Components of the covariance of the twists of all views of a rig, session after session."""
+    """Errors of the poses of a rig beside white scatter: components of the covariance of the twists of all its views.
+
+    Twists are left twists (6V,) about the centres that they were made with, session after session.
+    """
 
     names: tuple[str, ...]
-    components: Array  # (c, 6V, 6V) per unit of each
-    scales: Array  # (c,) that their σ usually has
-    effects: dict[str, tuple[str, Array]] = field(default_factory=dict)  # name of its component, (6V, P) its columns
-    # What each joint alone may do without a name, by what it follows: in none of the components.
+    components: Array  # (c, 6V, 6V) covariances for a variance of 1 of each component
+    scales: Array  # (c,) usual σ of each
+    # By effect of the library: the component that it is part of, and its columns (6V, P) at plausible sizes.
+    effects: dict[str, tuple[str, Array]] = field(default_factory=dict)
+    # Errors of single joints that no effect describes, by what they follow: diagnosis asks them, no component has them.
     joint_processes: dict[str, SmoothErrors] = field(default_factory=dict)
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
     flange_per_joint: Array = field(default_factory=lambda: np.zeros(2))
@@ -297,27 +296,27 @@ class PoseErrors:
 
     @property
     def causes(self) -> frozenset[str]:
-        """Names of all that poses may err by: effects of the library, and components that are not made of such."""
+        """Names of all causes of pose errors: effects of the library, and components that are not made of effects."""
         of_effects = {component for component, _ in self.effects.values()}
         return frozenset(self.effects) | {name for name in self.names if name not in of_effects}
 
     @property
     def arm_components(self) -> Mask:
-        """(c,) what joints and links do again: on a good arm all of it is small."""
+        """(c,) mask of the components that joints and links repeat: neither what wanders, nor stops, nor scatter."""
         return np.array([name not in NOT_OF_ARM for name in self.names], bool)
 
     @property
     def of_ordinary_arm(self) -> "PoseErrors":
-        """The same for an arm that errs mostly by its geometry: the scales of all other errors of the arm are reduced.
+        """These pose errors for an arm that errs mostly by its geometry: the scales of its other errors are reduced.
 
-        Kept are those of constant offsets and links (`_CONSTANT_EFFECTS`), and of what is no error of the arm.
+        Kept are the scales of constant offsets and links (`_CONSTANT_EFFECTS`), and of all that is no error of the arm.
         """
         beside = self.arm_components & ~np.isin(self.names, _CONSTANT_EFFECTS)
         return replace(self, scales=np.where(beside, _BESIDE_GEOMETRY, 1.0) * self.scales)
 
     @property
     def prior(self) -> FurtherPrior:
-        """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
+        """The prior of the components' sizes: every arm scatters by its joints, all else may be absent."""
         shapes = np.where(np.array(self.names) == JOINT_SCATTER, ALWAYS_PRESENT, MAY_BE_ABSENT)
         return FurtherPrior(self.scales, shapes, self.arm_components, self.scatter)
 
@@ -339,29 +338,34 @@ class PoseErrors:
         Args:
             keep: names of effects, or of components that are not made of effects.
         """
-        left = {name: part for name, part in self.effects.items() if name in keep}
+        effects = {name: part for name, part in self.effects.items() if name in keep}
         kept, components = list[int](), list[Array]()
         for i, name in enumerate(self.names):
-            every = [columns for component, columns in self.effects.values() if component == name]
-            those = [columns for component, columns in left.values() if component == name]
-            if those or (not every and name in keep):
+            all_columns = [columns for component, columns in self.effects.values() if component == name]
+            kept_columns = [columns for component, columns in effects.values() if component == name]
+            if kept_columns or (not all_columns and name in keep):
                 kept.append(i)
+                is_whole = len(kept_columns) == len(all_columns)
                 # What is left is summed anew: a difference of large numbers would not be positive.
-                untouched = len(every) == len(those)
-                components.append(self.components[i] if untouched else np.sum([X @ X.T for X in those], axis=0))
+                components.append(self.components[i] if is_whole else np.sum([X @ X.T for X in kept_columns], axis=0))
         n = self.components.shape[1]
         names = tuple(self.names[i] for i in kept)
         stacked = np.array(components).reshape(-1, n, n)
-        return replace(self, names=names, components=stacked, scales=self.scales[kept], effects=left)
+        return replace(self, names=names, components=stacked, scales=self.scales[kept], effects=effects)
 
     def with_component(self, name: str, component: Array, scale: float) -> "PoseErrors":
-        """The same with a further component (n, n)."""
+        """Return these pose errors with a further component.
+
+        Args:
+            component: (6V, 6V) covariance per unit, or as `project` has reduced the others.
+            scale: σ that it usually has.
+        """
         components = np.concatenate([self.components, component[None]])
         return replace(self, names=(*self.names, name), components=components, scales=np.append(self.scales, scale))
 
 
 def white_scatter_only(views: int) -> PoseErrors:
-    """Nothing beside white scatter."""
+    """Return the pose errors of a rig of so many views that has nothing beside white scatter: no components."""
     return PoseErrors((), np.zeros((0, 6 * views, 6 * views)), np.zeros(0))
 
 
@@ -378,12 +382,12 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white_scatter_only(sum(m.views.count for m in measurements))
-    # Covariance and usual σ of each component; per effect its component and its columns.
-    parts, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
-    processes, by_joints = dict[str, SmoothErrors](), np.zeros(2)
+    # Covariance and usual σ of each component; by effect its component and its columns.
+    components, effects = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
+    processes, flange_per_joint = dict[str, SmoothErrors](), np.zeros(2)
     sessions = list(zip(measurements, centres, strict=True))
     # (V, V) 1 where two views are scans of one stop: they share an error that is drawn once per stop.
-    anew = block_diag(*(m.capture.shares_stop for m in measurements))
+    shares_stop = block_diag(*(m.capture.shares_stop for m in measurements))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
         # Effects of one cause share a size.
@@ -392,25 +396,32 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
             columns = np.concatenate([effect_twists(m, model, centre, [e]) for m, centre in sessions])
             family = EFFECT_FAMILY.get(e.name, e.name)
             families[family].append(columns)
-            members[e.name] = (family, columns)
-        parts |= {name: (np.sum([X @ X.T for X in family], axis=0), _ARM_SCALE) for name, family in families.items()}
+            effects[e.name] = (family, columns)
+        for family, members in families.items():
+            components[family] = (np.sum([X @ X.T for X in members], axis=0), _ARM_SCALE)
         constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
         links = np.concatenate([effect_twists(m, model, centre, constant) for m, centre in sessions])
-        alike = rbf_joints(joints)
-        parts["smooth"] = (process_covariance(links, alike), SMOOTH_SCALE)
+        joint_kernel = rbf_joints(joints)
+        components["smooth"] = (process_covariance(links, joint_kernel), SMOOTH_SCALE)
         if constant[0].name == _OFFSET:
             offsets = links[:, : joints.shape[1]]
-            parts[JOINT_SCATTER] = (process_covariance(offsets, anew), USUAL_JOINT_SCATTER)
-            by_joints = mean_square_per_axis(offsets, measurements, centres)
-            processes = joint_processes(measurements, joints, offsets, alike)
+            components[JOINT_SCATTER] = (process_covariance(offsets, shares_stop), USUAL_JOINT_SCATTER)
+            flange_per_joint = mean_square_per_axis(offsets, measurements, centres)
+            processes = joint_processes(measurements, joints, offsets, joint_kernel)
     flange = flange_twists(measurements, centres)
     for name, memory in DRIFT_MEMORY.items():
-        parts[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
+        components[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
-    if same.sum() > anew.sum():
-        for name, half in zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True):
-            parts[name] = (process_covariance(half, same.astype(float)), 1.0)
-    components = np.array([covariance for covariance, _ in parts.values()])
-    scales = np.array([scale for _, scale in parts.values()])
+    if same.sum() > shares_stop.sum():
+        for name, columns in zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True):
+            components[name] = (process_covariance(columns, same.astype(float)), 1.0)
     rotation, translation = usual_twist(measurements[0].length_unit)[[0, 3]].tolist()
-    return PoseErrors(tuple(parts), components, scales, members, processes, by_joints, (rotation, translation))
+    return PoseErrors(
+        names=tuple(components),
+        components=np.array([covariance for covariance, _ in components.values()]),
+        scales=np.array([scale for _, scale in components.values()]),
+        effects=effects,
+        joint_processes=processes,
+        flange_per_joint=flange_per_joint,
+        scatter=(rotation, translation),
+    )

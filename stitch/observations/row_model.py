@@ -23,7 +23,7 @@ from stitch.observations.rows import Rows
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
-# Views of largest influence on the estimates: if one alone carries them, it is among these.
+# Views of largest influence on the estimates that are tested: if a single one decides them, it is among these.
 _CARRIERS = 20
 
 
@@ -38,16 +38,16 @@ class ReducedRows(Observation):
 
     @property
     def reach(self) -> float:
-        """Distance of what is seen from the flange: what a turn of it moves the points by."""
+        """Median distance, length_unit, from the flange to what is seen: by so much a radian of the flange moves it."""
         return self.rows.reach
 
     @property
     def numbers_per_view(self) -> int:
-        """Those of a view's block."""
+        """d, the number of reduced numbers in a view's block."""
         return int(self.reduction.of_views.shape[1])
 
     def from_twists(self, moved: Array) -> Array:
-        """Return numbers (C·d, P) of left twists (6V, P) of the views about the centre."""
+        """Return the change (C·d, P) of the reduced numbers by left twists (6V, P) of the views about the centre."""
         return flatten_blocks(self.reduction.reduce_twists(self.rows.lever @ moved.reshape(-1, 6, moved.shape[1])))
 
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
@@ -67,16 +67,16 @@ class ReducedRows(Observation):
         return out
 
     def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> "RowTrial":
-        """Return a model with columns (C·d, k)."""
+        """Return the trial of a model with columns `response` (C·d, k); `points` are not used."""
         return RowTrial(self, linear, linear.in_blocks(response))
 
     def affected_squares(self, views: Indices) -> Mask:
-        """Return the views themselves, (V,) bool."""
+        """Return a mask (V,) of the views themselves: each has a sum of squares of its own."""
         mask: Mask = np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
         return mask
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
-        """Return both ends of every joint's range, of the views that show anything."""
+        """Return both ends of every joint's range, for joints (V, n) rad, of the views that show anything."""
         return joint_ends(joints, np.flatnonzero(self.rows.used.any(axis=1)))
 
     def part_displacements(self, numbers: Array) -> Array:
@@ -86,7 +86,7 @@ class ReducedRows(Observation):
 
     @cached_property
     def _of_shifts(self) -> Array:
-        """(V, 3, d) shifts of the views that make their numbers."""
+        """(V, 3, d) from the numbers of a view to the shift of it, length_unit, that makes them by least squares."""
         V = len(self.rows.lever)
         return np.linalg.pinv(self.reduction.reduce_twists(self.rows.lever[..., 3:])[:V]).astype(float)
 
@@ -126,20 +126,19 @@ def row_model(measurement: Measurement, model: Model, rows: Rows) -> LinearModel
         measurement: with the sightings that count, others masked.
         model: about which the rows are linearised.
     """
-    extra = rows.columns_in_use(measurement, model)
     reduction = _reduction(measurement, model, rows)
     observation = ReducedRows(rows.capture, rows.centre, rows, reduction)
     base = reduction.reduce(np.concatenate([rows.hand_eye, rows.landmarks @ reduction.kept], axis=2))
-    extra = reduction.reduce(extra)
+    effects = reduction.reduce(rows.columns_in_use(measurement, model))
     sizes, values = sizes_of(model.terms), values_of(model.terms)
     # Parameters that the fit left at zero are not in the model.
     used = np.array([p.value != 0 and not p.discrete for p in stack_parameters(model.terms)], bool)
-    whole = observation.mixed_model(np.concatenate([base, extra[..., used]], axis=2))
-    null = fit_variances(whole, both_starts=True)
-    half = whitener(whole, null.variances)
-    white_extra = flatten_blocks(half @ extra)
-    seen = used & independent(flatten_blocks(half @ base), white_extra * used, sizes, 1 / UNSEEN)
-    A = np.concatenate([base, extra[..., seen]], axis=2)
+    with_all = observation.mixed_model(np.concatenate([base, effects[..., used]], axis=2))
+    null = fit_variances(with_all, both_starts=True)
+    inverse_root = whitener(with_all, null.variances)
+    white_base, white_effects = flatten_blocks(inverse_root @ base), flatten_blocks(inverse_root @ effects)
+    seen = used & independent(white_base, white_effects * used, sizes, 1 / UNSEEN)
+    A = np.concatenate([base, effects[..., seen]], axis=2)
     mixed = observation.mixed_model(A)
     if (seen != used).any():
         null = fit_variances(mixed, both_starts=True)
@@ -190,7 +189,7 @@ class RowTrial:
 
     @cached_property
     def _others(self) -> Indices:
-        """(p,) numbers of the columns that are no landmarks: the hand-eye's six, and all after the landmarks."""
+        """(p,) indices of the columns that are no landmarks: the hand-eye's six, and all after the landmarks."""
         at = 6 + self.observation.reduction.kept.shape[1]
         return np.delete(np.arange(self.X.shape[2]), slice(6, at))
 
@@ -208,32 +207,31 @@ class RowTrial:
         A row of a view varies by the sensor's noise and by the scatter of the view's pose. Its correlation with other
         rows is left out, as in the fit of a run.
         """
-        reduction = self.observation.reduction
-        views, noise = len(reduction.of_views), self.linear.null.variances[NOISE]
-        beyond = self.linear.covariance[:views] - noise * np.eye(reduction.of_views.shape[1])
-        Q = reduction.of_views
-        variance = np.ones(reduction.per_sigma.shape)
-        variance[:views] = noise + np.einsum("vdm,vde,vem->vm", Q, beyond, Q, optimize=True)
-        return np.where(reduction.per_sigma > 0, 1 / variance, 0.0)
+        per_sigma, Q = self.observation.reduction.per_sigma, self.observation.reduction.of_views
+        noise = self.linear.null.variances[NOISE]
+        pose_scatter = self.linear.covariance[: len(Q)] - noise * np.eye(Q.shape[1])
+        variance = np.ones(per_sigma.shape)
+        variance[: len(Q)] = noise + np.einsum("vdm,vde,vem->vm", Q, pose_scatter, Q, optimize=True)
+        return np.where(per_sigma > 0, 1 / variance, 0.0)
 
     def _sums(self, blocks: slice | Indices) -> tuple[Array, Array, Array]:
         """Return weighted sums over the rows of some blocks: LᵀWL (U, U), LᵀWX (U, p + 1) and XᵀWX (p + 1, p + 1).
 
         L are the columns of the U unknown landmarks, X those of `_rows`, with the observations as the last one.
         """
-        rows, weights = self._rows[blocks], self._weights[blocks].ravel()
+        X, weights = flatten_blocks(self._rows[blocks]), self._weights[blocks].reshape(-1, 1)
         B, m = self._weights.shape
-        points = self.observation.reduction.points[(np.arange(B)[blocks][:, None] * m + np.arange(m)).ravel()]
-        rows = flatten_blocks(rows)
-        weighted = weights[:, None] * rows
-        return (points.T @ points.multiply(weights[:, None]).tocsr()).toarray(), points.T @ weighted, rows.T @ weighted
+        L = self.observation.reduction.points[(np.arange(B)[blocks][:, None] * m + np.arange(m)).ravel()]
+        weighted = weights * X
+        return (L.T @ L.multiply(weights).tocsr()).toarray(), L.T @ weighted, X.T @ weighted
 
     @cached_property
     def _all(self) -> tuple[Array, Array, Array]:
+        """The sums of `_sums` over all blocks."""
         return self._sums(slice(None))
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """Return coefficients (U + k,) without some views."""
+        """Return the coefficients (U + k,) by weighted least squares without a prior, fitted without some views."""
         nothing = np.zeros(self.X.shape[2])
         return self.solve_each([CoefficientPrior(nothing, nothing)], left_out)[0]
 
@@ -247,33 +245,34 @@ class RowTrial:
             priors: each of the first coefficients of the columns; those beyond it are held at zero.
             left_out: numbers of views whose rows are not counted; None: all count.
         """
-        unknowns, across, own = self._all
+        LL, LX, XX = self._all
         if left_out is not None:
-            some = self._sums(np.asarray(left_out, np.int64))
-            unknowns, across, own = unknowns - some[0], across - some[1], own - some[2]
-        inverse = self._inverse(unknowns)
-        held = inverse @ across
-        left = own - across.T @ held
+            less_LL, less_LX, less_XX = self._sums(np.asarray(left_out, np.int64))
+            LL, LX, XX = LL - less_LL, LX - less_LX, XX - less_XX
+        # What the landmarks are for given columns, and the Schur complement of theirs.
+        landmarks = self._inverse(LL) @ LX
+        schur = XX - LX.T @ landmarks
+        U = len(LL)
         solutions = list[Array]()
         for prior in priors:
             others = self._others[self._others < len(prior.precision)]
             p = len(others)
             precision = prior.precision[others]
             unit = equilibrated(self._all[2][:p, :p] + np.diag(precision))[1]
-            x = solve_in_units(left[:p, :p] + np.diag(precision), left[:p, -1] + precision * prior.mean[others], unit)
-            solution = np.zeros(len(unknowns) + self.X.shape[2])
-            solution[: len(unknowns)] = held[:, -1] - held[:, :p] @ x
-            solution[len(unknowns) + others] = x
-            solutions.append(solution)
-        return [self._with_kept(solution) for solution in solutions]
+            x = solve_in_units(schur[:p, :p] + np.diag(precision), schur[:p, -1] + precision * prior.mean[others], unit)
+            solution = np.zeros(U + self.X.shape[2])
+            solution[:U] = landmarks[:, -1] - landmarks[:, :p] @ x
+            solution[U + others] = x
+            solutions.append(self._with_kept(solution))
+        return solutions
 
-    def _inverse(self, unknowns: Array) -> Array:
-        """(U, U) inverse of the landmarks' normal matrix (U, U); zero for a landmark that no view shows."""
-        diagonal = np.diag(unknowns)
-        if (unknowns == np.diag(diagonal)).all():
+    def _inverse(self, LL: Array) -> Array:
+        """Return the inverse (U, U) of the landmarks' normal matrix (U, U); zero for a landmark that no view shows."""
+        diagonal = np.diag(LL)
+        if (np.diag(diagonal) == LL).all():
             shown = diagonal > 1e-12 * np.diag(self._all[0])
             return np.diag(np.where(shown, 1 / np.where(shown, diagonal, 1.0), 0.0))
-        return symmetric_inverse(unknowns)
+        return symmetric_inverse(LL)
 
     def _with_kept(self, solution: Array) -> Array:
         """Return a solution (U + k,) in which the columns of landmarks, so far zero, have their coefficients too.
@@ -286,7 +285,7 @@ class RowTrial:
         return solution
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """(V,) sums of the squares of a view's residual distances, length_unit², under coefficients (U + k,).
+        """Return the sums (V,) of each view's squared residual distances, length_unit², under coefficients (U + k,).
 
         Args:
             units: views whose sums are returned; None: all.
@@ -307,23 +306,24 @@ class RowTrial:
         return float(np.sum((self.linear.whitening[left_out] @ of_pose) ** 2)) + beyond
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """(n,) at most `_CARRIERS` views, in the order of how far the coefficients move without each, to first order.
+        """Return at most `_CARRIERS` views (n,), first those without which the coefficients would move most.
 
-        It is the norm of H⁻¹ g_v, with H the normal matrix without the landmarks and g_v the gradient of view v alone.
+        The motion is, to first order, H⁻¹ g_v, with H the normal matrix without the landmarks and g_v the gradient of
+        view v alone.
         """
-        unknowns, across, own = self._all
-        held = self._inverse(unknowns) @ across[:, :-1]
+        LL, LX, XX = self._all
+        landmarks = self._inverse(LL) @ LX[:, :-1]
         V, m = len(self.observation.rows.lever), self._weights.shape[1]
         weighted = (self._weights[:V] * -self._rest(coefficients, np.arange(V)))[:, None]
-        pulls = (weighted @ self._rows[:V, :, :-1])[:, 0]
-        of_points = by_view(weighted) @ self.observation.reduction.points[: V * m]
-        pulls = pulls - of_points @ held
-        scaled, unit = equilibrated(own[:-1, :-1] - across[:, :-1].T @ held)
-        sizes = np.linalg.norm(pulls * unit @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True), axis=1)
-        return np.argsort(-sizes, kind="stable")[:_CARRIERS].astype(np.int64)
+        gradients = (weighted @ self._rows[:V, :, :-1])[:, 0]
+        of_landmarks = by_view(weighted) @ self.observation.reduction.points[: V * m]
+        gradients = gradients - of_landmarks @ landmarks
+        scaled, unit = equilibrated(XX[:-1, :-1] - LX[:, :-1].T @ landmarks)
+        motions = np.linalg.norm(gradients * unit @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True), axis=1)
+        return np.argsort(-motions, kind="stable")[:_CARRIERS].astype(np.int64)
 
     def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
-        """(n, m) residuals of n of the views under coefficients (U + k,), in units of the rows' sigmas."""
+        """Return the residuals (n, m) of n of the views under coefficients (U + k,), in units of the rows' sigmas."""
         V, m = len(self.observation.rows.lever), self._weights.shape[1]
         points = self.observation.reduction.points
         placed = (points[: V * m] @ coefficients[: points.shape[1]]).reshape(V, m)

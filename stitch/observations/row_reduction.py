@@ -22,20 +22,20 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class RowReduction:
-    """An orthonormal map of rows (B, m), in units of their noise, to numbers (C, d): V blocks of views, then others."""
+    """An orthonormal map of rows (B, m), each divided by its sigma, to numbers (C, d), V blocks of views first."""
 
-    per_sigma: Array  # (B, m) one over the sigma of a row, the sensor's or one that is known; 0 of absent rows
-    of_views: Array  # (V, d, m) what a motion of the view makes
-    beyond: Array  # (e, V·m) what no motion makes, but unknowns and effects of points
+    per_sigma: Array  # (B, m) 1/sigma of each row, by the sensor's noise or a known variance; 0 of absent rows
+    of_views: Array  # (V, d, m) orthonormal rows: d numbers of each view that say all of its pose
+    beyond: Array  # (e, V·m) orthonormal rows: numbers that landmarks or effects of points change, no pose
     known: Mask  # (B, m) rows whose variance is known: each a number by itself
-    noise_only: tuple[int, float]  # how many further numbers are noise alone, and their sum of squares
-    points: csr_array  # (B·m, U) rows in those units per unknown of what is seen
-    kept: Array  # (U, r) combinations of the unknowns that poses answer to; noise alone shows the others
-    shares: Array  # (r, U) how much of each of these is in the unknowns
+    noise_only: tuple[int, float]  # count of further numbers that are noise alone, and their sum of squares
+    points: csr_array  # (B·m, U) change of the rows, times `per_sigma`, per unknown of the landmarks
+    kept: Array  # (U, r) combinations of these unknowns that poses or known rows depend on: the others are eliminated
+    shares: Array  # (r, U) coefficients of these combinations, of the unknowns
 
     @property
     def blocks(self) -> int:
-        """C."""
+        """Number C of blocks of the reduced numbers."""
         views, size, _ = self.of_views.shape
         return views - (-(len(self.beyond) + int(self.known.sum())) // size)
 
@@ -52,11 +52,11 @@ class RowReduction:
         return self._in_blocks(np.concatenate([own, across, white[self.known]]))
 
     def reduce_twists(self, rows: Array) -> Array:
-        """Return numbers (C, d, P) of rows (V, m, P) that motions of the views make."""
+        """Return the reduced numbers (C, d, P) of rows (V, m, P) that motions of the views cause."""
         return self._in_blocks(flatten_blocks(self.of_views @ (self.per_sigma[: len(rows), :, None] * rows)))
 
     def expand(self, numbers: Array) -> Array:
-        """Return rows (B, m, P), divided by their sigmas, that `reduce` makes numbers (C, d, P) of: the shortest such.
+        """Return the shortest rows (B, m, P), divided by their sigmas, that `reduce` maps to numbers (C, d, P).
 
         What the places of eliminated targets do to the rows is not among them.
         """
@@ -98,9 +98,9 @@ def pose_numbers(lever: Array) -> Array:
         lever: (V, m, 6) change of the m rows of a view per twist of it, each row divided by its sigma.
     """
     length = np.sqrt(np.maximum((lever**2).sum(axis=(0, 1)), 1e-300))
-    turned, sizes, _ = np.linalg.svd(lever / length, full_matrices=False)
+    basis, sizes, _ = np.linalg.svd(lever / length, full_matrices=False)
     shown = sizes > _ROUNDING * sizes.max(axis=1, initial=1e-300, keepdims=True)
-    return np.ascontiguousarray((turned * shown[:, None]).transpose(0, 2, 1))
+    return np.ascontiguousarray((basis * shown[:, None]).transpose(0, 2, 1))
 
 
 def reduction_of(
@@ -108,9 +108,12 @@ def reduction_of(
 ) -> RowReduction:
     """Return the map of all rows to few numbers that are sufficient for poses, landmarks and effects of points.
 
-    In units of the rows' sigmas: d numbers a view span what its motion does; the landmarks that no pose depends on are
-    eliminated (`alone`); of the rest the directions that other landmarks and effects move are kept (`beyond`). What is
-    left over is noise alone, and only its sum of squares is kept.
+    In units of the rows' sigmas:
+
+    1. d numbers a view span what a motion of it changes.
+    2. Combinations of landmarks that change none of these, nor rows of known variance, are eliminated.
+    3. What is left of the other landmarks, and of effects, spans the directions `beyond`.
+    4. All other directions are noise alone: only their count and sum of squares are kept.
 
     Args:
         residual: (B, m) of the rows; their units are squared in `noise` and `known`.
@@ -127,30 +130,36 @@ def reduction_of(
     points = csr_array(unknowns.reshape(-1, U)).multiply(per_sigma.reshape(-1, 1)).tocsr()
     length = np.sqrt(points.multiply(points).sum(axis=0))
     per_length = np.where(length > 0, length, np.inf) ** -1
-    turn = by_view(of_views)
+    pose_rows = by_view(of_views)
     in_views = points[: V * m]
-    # What landmarks do to poses and to known rows: combinations that do nothing there are seen by noise alone.
-    shown = np.vstack([(turn @ in_views).toarray(), points[V * m :].toarray()]) * per_length
+    # What landmarks change of poses and of known rows; combinations that change nothing there are eliminated.
+    shown = np.vstack([(pose_rows @ in_views).toarray(), points[V * m :].toarray()]) * per_length
     _, sizes, directions = np.linalg.svd(np.linalg.qr(shown, mode="r"))
     rank = int((sizes > _ROUNDING * sizes.max(initial=1e-300)).sum())
-    kept, alone = per_length[:, None] * directions[:rank].T, per_length[:, None] * directions[rank:].T
-    shares = directions[:rank] * length
-    information = alone.T @ (in_views.T @ in_views @ alone)
-    of_alone = symmetric_inverse(information) if alone.size else information
+    kept, eliminated = per_length[:, None] * directions[:rank].T, per_length[:, None] * directions[rank:].T
+    information = eliminated.T @ (in_views.T @ in_views @ eliminated)
+    inverse = symmetric_inverse(information) if eliminated.size else information
 
     def rest(white: Array) -> Array:
-        """Return columns (V·m, P), what poses and the landmarks `alone` can make projected out."""
-        white = white - turn.T @ (turn @ white)
-        return white - in_views @ (alone @ (of_alone @ (alone.T @ (in_views.T @ white))))
+        """Return columns (V·m, P) less what poses and eliminated landmarks can explain of them."""
+        white = white - pose_rows.T @ (pose_rows @ white)
+        return white - in_views @ (eliminated @ (inverse @ (eliminated.T @ (in_views.T @ white))))
 
-    seen = flatten_blocks((per_sigma[..., None] * of_points)[:V])
-    beyond = _row_space(rest(np.hstack([in_views @ kept, seen])), np.hstack([in_views @ kept, seen]))
-    left = rest((per_sigma * residual)[:V].reshape(-1, 1))[:, 0]
-    left = left - beyond.T @ (beyond @ left)
-    placed = np.linalg.matrix_rank(information, hermitian=True) if alone.size else 0
+    others = np.hstack([in_views @ kept, flatten_blocks((per_sigma[..., None] * of_points)[:V])])
+    beyond = _row_space(rest(others), others)
+    noise_rows = rest((per_sigma * residual)[:V].reshape(-1, 1))[:, 0]
+    noise_rows = noise_rows - beyond.T @ (beyond @ noise_rows)
+    placed = np.linalg.matrix_rank(information, hermitian=True) if eliminated.size else 0
     count = int((noise[:V] > 0).sum() - of_views.any(axis=2).sum() - placed - len(beyond))
     return RowReduction(
-        per_sigma, of_views, beyond, known > 0, (count, float(left @ left) if count else 0.0), points, kept, shares
+        per_sigma=per_sigma,
+        of_views=of_views,
+        beyond=beyond,
+        known=known > 0,
+        noise_only=(count, float(noise_rows @ noise_rows) if count else 0.0),
+        points=points,
+        kept=kept,
+        shares=directions[:rank] * length,
     )
 
 
@@ -168,7 +177,7 @@ def _row_space(rest: Array, whole: Array) -> Array:
         whole: (n, P) the same columns before something was projected out; they say what rounding is.
     """
     length = np.linalg.norm(rest, axis=0)
-    there = length > _ROUNDING * np.linalg.norm(whole, axis=0)
-    Q, R = np.linalg.qr(rest[:, there] / length[there])
+    is_left = length > _ROUNDING * np.linalg.norm(whole, axis=0)
+    Q, R = np.linalg.qr(rest[:, is_left] / length[is_left])
     U, sizes, _ = np.linalg.svd(R)
     return np.ascontiguousarray((Q @ U[:, sizes > _ROUNDING * sizes.max(initial=1e-300)]).T)

@@ -24,45 +24,48 @@ from stitch.session.measurement import Measurement
 
 @dataclass(frozen=True, kw_only=True)
 class Rows(ABC):
-    """V views, B ≥ V blocks of m rows, those beyond V of no view; U unknowns beside the hand-eye."""
+    """Observations as B blocks of m rows, linearised about a model: the first V blocks are those of the V views.
+
+    Beside the hand-eye they have U unknowns, such as places of targets.
+    """
 
     capture: Capture  # without the effects in use
-    T_mount: Array  # (4, 4)
-    centre: Array  # (3,) about which twists of the views count, reference frame
-    residual: Array  # (B, m) what a view shows less what it should
-    lever: Array  # (V, m, 6) rows per left twist of the view about the centre
-    landmarks: Array  # (B, m, U) rows per unknown of what is seen: places of targets, a plane
+    T_mount: Array  # (4, 4) maps sensor to mount
+    centre: Array  # (3,) point of the reference frame about which twists of the views turn
+    residual: Array  # (B, m) observed numbers less those that the model predicts
+    lever: Array  # (V, m, 6) change of the rows per left twist of the view about the centre
+    landmarks: Array  # (B, m, U) change of the rows per unknown of what is seen: places of targets, a plane
     noise: Array  # (B, m) variance of the sensor; 0 where a row is absent or none of the sensor's
 
     @abstractmethod
     def point_rows(self, moved: Array) -> Array:
-        """(P, V, m) change of the rows where labelled points move by (P, V, S, 3), reference frame."""
+        """Return the change (P, V, m) of the rows where labelled points move by (P, V, S, 3), reference frame."""
 
     @property
     def fixed(self) -> Array:
-        """(B, m) variance that is known: 1 in absent rows."""
+        """(B, m) variance of each row that is known, not fitted: 1 in absent rows, as covariances need an inverse."""
         return (self.noise == 0).astype(float)
 
     @cached_property
     def used(self) -> Mask:
-        """(V, m) bool: rows of the views that were measured."""
+        """(V, m) mask of the rows of views that were measured."""
         return self.noise[: len(self.lever)] > 0
 
     @cached_property
     def distances_used(self) -> Mask:
-        """(V, m) bool: those of them that are lengths, as what remains is told."""
+        """(V, m) mask of the measured rows that are lengths: rms residuals are of these."""
         return self.used
 
     @cached_property
     def hand_eye(self) -> Array:
-        """(B, m, 6) rows per right perturbation of the hand-eye."""
+        """(B, m, 6) change of the rows per right twist ξ of the hand-eye, T_mount·exp(ξ); zero in blocks of no view."""
         to_centre = frames.make(np.eye(3), -self.centre)
         of_views = self.lever @ frames.adjoint(to_centre @ self.capture.hand_eye_frames(self.T_mount))
         return np.concatenate([of_views, np.zeros((len(self.residual) - len(of_views), *of_views.shape[1:]))])
 
     @property
     def reach(self) -> float:
-        """Distance of what is seen from the flange: what a turn of it moves the points by."""
+        """Median distance, length_unit, from the flange to what is seen: by so much a radian of the flange moves it."""
         away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
         return float(max(np.median(away), 1e-9))
 
@@ -71,25 +74,22 @@ class Rows(ABC):
 
         An effect that moves a view as a whole acts through `lever`; one that moves points, through the targets.
         """
-        of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
+        derivatives = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
         poses = self.capture.poses(self.T_mount)
-        out = []
+        columns = []
         for term in terms:
-            if not moves_points([term]):
-                moved = next(of_views)
-                rows = np.zeros((*self.residual.shape, len(moved)))
-                rows[: len(poses)] = self.lever @ moved.reshape(len(moved), -1, 6).transpose(1, 2, 0)
-                out.append(rows)
-                continue
-            slopes = PointSlopes(measurement, [term], model).at_targets(poses)
-            rows = np.zeros((*self.residual.shape, len(slopes)))
-            rows[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
-            rows[: len(poses)][~self.used] = 0.0
-            out.append(rows)
-        return out
+            of_term = np.zeros((*self.residual.shape, len(term.parameters)))
+            if moves_points([term]):
+                slopes = PointSlopes(measurement, [term], model).at_targets(poses)
+                of_term[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
+                of_term[: len(poses)][~self.used] = 0.0
+            else:
+                of_term[: len(poses)] = self.lever @ next(derivatives).transpose(1, 2, 0)
+            columns.append(of_term)
+        return columns
 
     def columns_in_use(self, measurement: Measurement, model: Model) -> Array:
-        """(B, m, P) how the rows answer to all parameters of the effects in use."""
+        """Return the change (B, m, P) of the rows per unit of each parameter of the effects in use."""
         columns = self.effect_columns(measurement, model, model.terms)
         return np.concatenate([np.zeros((*self.residual.shape, 0)), *columns], axis=2)
 
@@ -124,11 +124,12 @@ class Rows(ABC):
 
     @cached_property
     def scattered(self) -> tuple[Array, Array]:
-        """(V, m, 3) rows per rotation, and per translation, of the flange in its own frame."""
+        """(V, m, 3) changes of the rows per rotation, and per translation, of the flange in its own frame."""
         to_centre = frames.make(np.eye(3), -self.centre)
         carried = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
         return carried[..., :3], carried[..., 3:]
 
     @cached_property
     def _common_covariance(self) -> CommonCovariance | None:
+        """The blocks in groups of one covariance but for a rotation; None where they form none."""
         return common_covariance(self.scattered, self.noise, self.fixed)

@@ -47,9 +47,10 @@ def closed_form_hand_eye(capture: Capture) -> Array:
         used = s.used.any(axis=1)
         A = frames.inverse(capture.T_reference_mount[used])
         return shah(A, frames.make(s.rotation[used], s.points[used, 0]))[1]
-    points = _PointEquations(capture, s)
-    ends = [points.improved(R) for R in [*points.linear_starts(), *_starts_from_motions(capture, s)]]
-    return min(ends, key=lambda end: end[1])[0]
+    equations = _PointEquations(capture, s)
+    starts = [*equations.linear_starts(), *_starts_from_motions(capture, s)]
+    T_mount, _ = min(map(equations.improved, starts), key=lambda solution: solution[1])
+    return T_mount
 
 
 def sensor_motions(s: Sightings) -> tuple[Indices, Array]:
@@ -117,35 +118,43 @@ class _PointEquations:
         Raises:
             NoResultError: the motions of the flange, or the targets, do not determine the hand-eye.
         """
+        solutions = [self._linear_solution(on_sphere) for on_sphere in (True, False)]
+        near = [R for R in solutions if np.abs(np.linalg.svd(R, compute_uv=False) - 1).max() < _NO_ROTATION]
+        return [frames.nearest_rotation(R) for R in near or solutions]
+
+    def _linear_solution(self, on_sphere: bool) -> Array:
+        """Return R (3, 3), not yet a rotation, by linear least squares in vec R and t (3,), repeatedly weighted.
+
+        Args:
+            on_sphere: True: |vec R|² = 3 is imposed.
+
+        Raises:
+            NoResultError: the motions of the flange, or the targets, do not determine the hand-eye.
+        """
         L = self.left[:, :3, :3]
         columns = np.concatenate([np.einsum("nij,nk->nijk", L, self.p).reshape(-1, 3, 9), L], axis=2)
-        ends = []
-        for on_sphere in (True, False):
-            weight = np.ones(len(L))
-            for _ in range(_REWEIGHTED):
-                C, b = self._centred(columns, weight), self._centred(self.left[:, :3, 3:] / self.scale, weight)
-                root = np.sqrt(weight)[:, None, None]
-                A, right = (root * C).reshape(-1, 12), -(root * b).ravel()
-                # t is projected out, vec R solved, and t found from it.
-                Q, of_t = np.linalg.qr(A[:, 9:])
-                shown, said = A[:, :9] - Q @ (Q.T @ A[:, :9]), right - Q @ (Q.T @ right)
-                values = np.linalg.svd(shown, compute_uv=False)
-                if values[-1] < _DEGENERATE * values[0] or len(A) < 12:
-                    raise NoResultError(
-                        "these views do not show the hand-eye: turn the flange about two axes at least and show three "
-                        "targets that are not in one line, or give scanner.pose in session.toml"
-                    )
-                if on_sphere:
-                    vec = minimise_on_sphere(shown.T @ shown, shown.T @ said, np.sqrt(3.0))
-                else:
-                    vec = np.linalg.lstsq(shown, said, rcond=None)[0].astype(float)
-                t = np.linalg.lstsq(of_t, Q.T @ (right - A[:, :9] @ vec), rcond=_DEGENERATE)[0]
-                rest = np.linalg.norm(C @ np.append(vec, t) + b[..., 0], axis=1)
-                weight = _weights(rest)
-            R = vec.reshape(3, 3)
-            ends.append(R * np.sign(np.linalg.det(R)) if on_sphere else R)
-        near = [R for R in ends if np.abs(np.linalg.svd(R, compute_uv=False) - 1).max() < _NO_ROTATION]
-        return [frames.nearest_rotation(R) for R in near or ends]
+        weight = np.ones(len(L))
+        for _ in range(_REWEIGHTED):
+            C, b = self._centred(columns, weight), self._centred(self.left[:, :3, 3:] / self.scale, weight)
+            root = np.sqrt(weight)[:, None, None]
+            A, right = (root * C).reshape(-1, 12), -(root * b).ravel()
+            # t is projected out, vec R solved, and t found from it.
+            Q, of_t = np.linalg.qr(A[:, 9:])
+            A_R, right_R = A[:, :9] - Q @ (Q.T @ A[:, :9]), right - Q @ (Q.T @ right)
+            values = np.linalg.svd(A_R, compute_uv=False)
+            if values[-1] < _DEGENERATE * values[0] or len(A) < 12:
+                raise NoResultError(
+                    "these views do not show the hand-eye: turn the flange about two axes at least and show three "
+                    "targets that are not in one line, or give scanner.pose in session.toml"
+                )
+            if on_sphere:
+                vec = minimise_on_sphere(A_R.T @ A_R, A_R.T @ right_R, np.sqrt(3.0))
+            else:
+                vec = np.linalg.lstsq(A_R, right_R, rcond=None)[0].astype(float)
+            t = np.linalg.lstsq(of_t, Q.T @ (right - A[:, :9] @ vec), rcond=_DEGENERATE)[0]
+            weight = _weights(np.linalg.norm(C @ np.append(vec, t) + b[..., 0], axis=1))
+        R = vec.reshape(3, 3)
+        return R * np.sign(np.linalg.det(R)) if on_sphere else R
 
     def improved(self, R: Array) -> tuple[Array, float]:
         """Return T_mount_sensor (4, 4) from a start R (3, 3), and the sum of its residual distances, over `scale`.
@@ -159,21 +168,21 @@ class _PointEquations:
         # The first solution is of t alone.
         for step in range(_STEPS):
             turned = self.p @ R.T
-            seen = L @ (turned + t)[..., None] + self.left[:, :3, 3:] / self.scale
+            placed = L @ (turned + t)[..., None] + self.left[:, :3, 3:] / self.scale
             columns = self._centred(np.concatenate([-L @ frames.skew(turned), L], axis=2), weight)
-            rest = self._centred(seen, weight)
+            residual = self._centred(placed, weight)
             free = slice(3 if step == 0 else 0, 6)
             root = np.sqrt(weight)[:, None, None]
             x = np.zeros(6)
-            rows, right = (root * columns[..., free]).reshape(3 * len(L), -1), -(root * rest).ravel()
+            rows, right = (root * columns[..., free]).reshape(3 * len(L), -1), -(root * residual).ravel()
             x[free] = np.linalg.lstsq(rows, right, rcond=_DEGENERATE)[0]
-            left = np.linalg.norm(rest[..., 0] + columns @ x, axis=1)
-            weight = _weights(left)
+            distances = np.linalg.norm(residual[..., 0] + columns @ x, axis=1)
+            weight = _weights(distances)
             R = frames.exp(np.append(x[:3], np.zeros(3)))[:3, :3] @ R
             t = t + x[3:]
             if step and np.abs(x).max() < _STEP_ENDS:
                 break
-        return frames.make(R, self.scale * t - R @ self.offset), float(left.sum())
+        return frames.make(R, self.scale * t - R @ self.offset), float(distances.sum())
 
     def _centred(self, rows: Array, weight: Array) -> Array:
         """Return rows (N, 3, c) less the weighted mean of the rows of the same target: its place is eliminated."""
@@ -182,7 +191,7 @@ class _PointEquations:
         return (flat - means[self.target]).reshape(rows.shape)
 
 
-def _weights(left: Array) -> Array:
-    """Return 1/|residual| (N,), of mean 1."""
-    weight = 1 / np.maximum(left, 1e-3 * np.median(left) + 1e-12)
+def _weights(distances: Array) -> Array:
+    """Return weights (N,) 1/|residual|, of mean 1, for residual distances (N,)."""
+    weight = 1 / np.maximum(distances, 1e-3 * np.median(distances) + 1e-12)
     return weight / weight.mean()

@@ -79,16 +79,19 @@ def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
     distances = rows.distances(rows.residual)
     view_rms = np.sqrt(np.nansum(distances**2, axis=1) / np.maximum(sightings.used.sum(axis=1), 1))
     view_rms[~seen] = np.nan
-    deviation, misfit, view_times = (x / max(float(np.nanmedian(x)), 1e-300) for x in (deviation, misfit, view_rms))
+    # Each over its median in these data.
+    deviation_times, misfit_times, rms_times = (
+        x / max(float(np.nanmedian(x)), 1e-300) for x in (deviation, misfit, view_rms)
+    )
     several = sightings.used.sum(axis=1) > 1
     outliers = []
     for v in np.flatnonzero(seen):
-        slot = int(np.nanargmax(deviation[v]))
-        if several[v] and misfit[v] > LIMIT_TARGET and deviation[v, slot] > LIMIT_TARGET:
+        slot = int(np.nanargmax(deviation_times[v]))
+        if several[v] and misfit_times[v] > LIMIT_TARGET and deviation_times[v, slot] > LIMIT_TARGET:
             name = sightings.targets[sightings.target[v, slot]]
-            outliers.append(Outlier(int(v), name, float(distance[v, slot]), float(deviation[v, slot])))
-        elif view_times[v] > LIMIT_VIEW:
-            outliers.append(Outlier(int(v), None, float(view_rms[v]), float(view_times[v])))
+            outliers.append(Outlier(int(v), name, float(distance[v, slot]), float(deviation_times[v, slot])))
+        elif rms_times[v] > LIMIT_VIEW:
+            outliers.append(Outlier(int(v), None, float(view_rms[v]), float(rms_times[v])))
     return outliers
 
 
@@ -104,11 +107,12 @@ def _slot_deviations(P: Array, residual: Array, slots: int) -> tuple[Array, Arra
         slots: S.
     """
     V = len(P)
-    pushed = np.einsum("vij,vj->vi", P, residual)[:, : 3 * slots].reshape(V, slots, 3)
+    Pe = np.einsum("vij,vj->vi", P, residual)[:, : 3 * slots].reshape(V, slots, 3)
     blocks = P[:, : 3 * slots, : 3 * slots].reshape(V, slots, 3, slots, 3)
-    blocks = np.moveaxis(blocks[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # (V, S, 3, 3)
-    apart = np.einsum("vsij,vsj->vsi", np.linalg.inv(blocks), pushed)
-    return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
+    blocks = np.moveaxis(blocks[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # P_ss (V, S, 3, 3)
+    deviation = np.einsum("vsij,vsj->vsi", np.linalg.inv(blocks), Pe)
+    sigmas = np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", Pe, deviation), 0.0))
+    return sigmas, np.linalg.norm(deviation, axis=2)
 
 
 def mask_outliers(used: Mask, outliers: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
@@ -136,11 +140,11 @@ class MislabelledView:
 
     @property
     def outlier(self) -> Outlier:
-        """All that the view shows of targets."""
+        """The view as an outlier: none of its targets counts."""
         return Outlier(self.view, None, self.distance, self.times)
 
     def message(self, view: str) -> str:
-        """What happened and what to do, with the name of the view."""
+        """Return what happened and what to do, in sentences, for the view of this name."""
         named = "; ".join(f"{stated} is {right}" for stated, right in self.names[:COMPARED_TARGETS])
         if len(self.names) > COMPARED_TARGETS:
             named += f" … and {len(self.names) - COMPARED_TARGETS} more"
@@ -158,24 +162,27 @@ def find_mislabelled(sightings: Sightings) -> tuple[MislabelledView, ...]:
     `LIMIT_TARGET` sigmas. Of many targets in a view, some are compared, spread over its list.
     """
     places = target_positions(sightings)
-    worst, usually = _distance_deviations(places)
-    scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * usually)
-    suspects = np.flatnonzero(worst > LIMIT_TARGET * scatter)
+    largest, median_deviation = _distance_deviations(places)
+    scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * median_deviation)
+    suspects = np.flatnonzero(largest > LIMIT_TARGET * scatter)
+    if not len(suspects):
+        return ()
     # Distances (K, K) between targets as most views have them, NaN where few do.
-    usual = np.empty((places.shape[1],) * 2 if len(suspects) else (0, 0))
+    usual = np.empty((places.shape[1],) * 2)
     for k, row in enumerate(usual):
-        apart = np.linalg.norm(places - places[:, k : k + 1], axis=2)
-        row[:] = np.where(np.isfinite(apart).sum(axis=0) < _MIN_VIEWS, np.nan, nan_median(apart))
+        distances = np.linalg.norm(places - places[:, k : k + 1], axis=2)
+        row[:] = np.where(np.isfinite(distances).sum(axis=0) < _MIN_VIEWS, np.nan, nan_median(distances))
     mislabelled = []
     for v in suspects:
         shown = np.flatnonzero(np.isfinite(places[v, :, 0]))
-        within = min(LIMIT_TARGET * scatter, _CLEARER * worst[v])
-        fits = list(_consistent_labels(target_distances(places[v : v + 1, shown])[0], usual, within))
-        if fits:
+        within = min(LIMIT_TARGET * scatter, _CLEARER * largest[v])
+        assignments = list(_consistent_labels(target_distances(places[v : v + 1, shown])[0], usual, within))
+        if assignments:
             stated = [sightings.targets[k] for k in shown]
-            right = [sightings.targets[k] for k in fits[0]]
-            names = tuple((a, b) for a, b in zip(stated, right, strict=True) if a != b)
-            mislabelled.append(MislabelledView(int(v), names if len(fits) == 1 else (), worst[v], worst[v] / scatter))
+            right = [sightings.targets[k] for k in assignments[0]]
+            renamed = tuple((a, b) for a, b in zip(stated, right, strict=True) if a != b)
+            names = renamed if len(assignments) == 1 else ()
+            mislabelled.append(MislabelledView(int(v), names, largest[v], largest[v] / scatter))
     return tuple(mislabelled)
 
 
@@ -224,17 +231,18 @@ def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterato
         usual: (K, K) between the targets by name, NaN where not known.
         within: largest difference that counts as equal, length_unit.
     """
+    # Names given so far, and for the target after each of them the names that are still to be tried.
     named = list[int]()
-    trials = given = 0
     choices: list[Iterator[int]] = [iter(range(len(usual)))]
-    while choices and trials < _TRIALS and given < 2:
+    trials = found = 0
+    while choices and trials < _TRIALS and found < 2:
         k = next(choices[-1], None)
         trials += 1
         if k is None:
             choices.pop()
             named = named[:-1]
         elif len(named) + 1 == len(distances):
-            given += 1
+            found += 1
             yield [*named, k]
         else:
             named.append(k)
@@ -243,6 +251,8 @@ def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterato
 
 def _consistent_targets(distances: Array, usual: Array, named: list[int], within: float) -> list[int]:
     """Return the numbers of the names that a further target can have, by its distances to d targets already named.
+
+    Only the first `COMPARED_TARGETS` of these are compared, and `_MIN_TARGETS` of the distances must be known.
 
     Args:
         distances: (d,) to these, length_unit.

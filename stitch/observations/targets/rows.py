@@ -25,7 +25,7 @@ COMPARED_TARGETS = 24
 
 
 def target_positions(sightings: Sightings) -> Array:
-    """Return where each view shows each target, (V, K, 3), sensor frame; NaN where it does not."""
+    """Return the place (V, K, 3) of each of K targets in each view, sensor frame; NaN where a view does not show it."""
     places = np.full((len(sightings.target), len(sightings.targets), 3), np.nan)
     view, slot = np.nonzero(sightings.used)
     places[view, sightings.target[view, slot]] = sightings.points[view, slot]
@@ -33,12 +33,12 @@ def target_positions(sightings: Sightings) -> Array:
 
 
 def target_distances(places: Array) -> Array:
-    """(V, K, K) between targets, NaN where a view does not show both."""
+    """Return the distances (V, K, K) between targets at places (V, K, 3); NaN where a view does not show both."""
     return np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
 
 
 def distance_sigma(sightings: Sightings) -> float:
-    """What the noise of two coordinates leaves of a distance, length_unit."""
+    """Return the sigma, length_unit, of a distance between two targets by the sensor's noise, from the median."""
     return float(np.sqrt(2) * np.median(sightings.sigma[sightings.used]))
 
 
@@ -53,7 +53,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """K targets in the reference frame; the unknowns are 3K positions, 3 of a probe's turn, 6 of a drawing."""
+    """K targets in the reference frame; the U unknowns are 3K positions, 3 of a probe's turn, 6 of a drawing's pose."""
 
     positions: Array  # (K, 3)
     orientation: Array | None = None  # (3, 3) R_reference_probe
@@ -62,7 +62,7 @@ class Landmarks:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number U of unknowns."""
         return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
 
     def updated(self, by: Array) -> "Landmarks":
@@ -115,16 +115,16 @@ def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None 
     placed = frames.transform(poses, s.points)
     positions = np.full((len(s.targets), 3), np.nan)
     for k in range(len(s.targets)):
-        here = placed[s.used & (s.target == k)]
-        if len(here):
-            positions[k] = np.median(here, axis=0)
+        of_target = placed[s.used & (s.target == k)]
+        if len(of_target):
+            positions[k] = np.median(of_target, axis=0)
     orientation = None
     if s.rotation is not None:
-        turned = (poses[:, :3, :3] @ s.rotation)[s.used.any(axis=1)]
-        first = frames.nearest_rotation(np.median(turned, axis=0))
+        R_reference_probe = (poses[:, :3, :3] @ s.rotation)[s.used.any(axis=1)]
+        first = frames.nearest_rotation(np.median(R_reference_probe, axis=0))
         # The median of matrices is no rotation and is biased; that of rotation vectors from it is neither.
-        off = Rotation.from_matrix(turned @ first.T).as_rotvec()
-        orientation = Rotation.from_rotvec(np.median(off, axis=0)).as_matrix() @ first
+        deviations = Rotation.from_matrix(R_reference_probe @ first.T).as_rotvec()
+        orientation = Rotation.from_rotvec(np.median(deviations, axis=0)).as_matrix() @ first
     if drawing is None:
         return Landmarks(positions, orientation)
     seen = np.isfinite(positions[drawing.target]).all(axis=1)
@@ -134,15 +134,15 @@ def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None 
 
 @dataclass(frozen=True, kw_only=True)
 class TargetRows(Rows):
-    """Rows of labelled points; U unknowns of the landmarks."""
+    """Rows of labelled points: 3S coordinates of S slots a view, of a probe its turn too; then rows of a drawing."""
 
-    variance: Array  # (B, m) that is known: 1 in absent rows, that of the drawing in its own
+    variance: Array  # (B, m) known variance: 1 in absent rows, that of the drawing in its rows
     positions: int  # the first 3S rows of a view are coordinates
     places: Landmarks  # about which the rows are linearised
 
     @property
     def fixed(self) -> Array:
-        """(B, m) variance that is known: 1 in absent rows, that of the drawing in its own."""
+        """(B, m) known variance of each row: see `variance`."""
         return self.variance
 
     @property
@@ -153,17 +153,21 @@ class TargetRows(Rows):
 
     @cached_property
     def distances_used(self) -> Mask:
-        """(V, m) bool: coordinates that were measured; a probe's turn is no length."""
+        """(V, m) mask of the coordinates that were measured; a probe's turn is no length."""
         return self.used & (np.arange(self.residual.shape[1]) < self.positions)
 
     def point_rows(self, moved: Array) -> Array:
-        """(P, V, m) the coordinates; a probe's turn stays."""
+        """Return the change (P, V, m) of the rows where points move by (P, V, S, 3); a probe's turn stays."""
         out = np.zeros((*moved.shape[:2], self.residual.shape[1]))
         out[..., : self.positions] = moved.reshape(*moved.shape[:2], -1)
         return out
 
     def distances(self, left: Array) -> Array:
-        """(V, S) 3D distances of rows (B, m) from zero; NaN where nothing was measured."""
+        """Return 3D distances (V, S) from zero, of the coordinates in rows (B, m); NaN where nothing was measured.
+
+        Args:
+            left: residuals of the rows.
+        """
         views = len(self.lever)
         d = np.linalg.norm(left[:views, : self.positions].reshape(views, -1, 3), axis=2)
         return np.where(self.used[:, : self.positions : 3], d, np.nan)
@@ -186,20 +190,19 @@ def target_rows(capture: Capture, T_mount: Array, landmarks: Landmarks) -> Targe
     parts = [_coordinate_rows(s, poses, centre, landmarks)]
     if s.rotation is not None:
         parts.append(_orientation_rows(s, poses, landmarks))
-    left, noise, lever, columns = (np.concatenate(blocks, axis=1) for blocks in zip(*parts, strict=True))
+    residual, noise, lever, columns = (np.concatenate(blocks, axis=1) for blocks in zip(*parts, strict=True))
     absent = noise == 0
-    left[absent], lever[absent], columns[absent] = 0.0, 0.0, 0.0
-    of_drawing, moved_in_drawing, known = _drawing_rows(landmarks, left.shape[1])
-    nothing = np.zeros_like(of_drawing)
+    residual[absent], lever[absent], columns[absent] = 0.0, 0.0, 0.0
+    drawing_residual, drawing_columns, drawing_variance = _drawing_rows(landmarks, residual.shape[1])
     return TargetRows(
         capture=capture,
         T_mount=T_mount,
         centre=centre,
-        residual=np.concatenate([left, of_drawing]),
+        residual=np.concatenate([residual, drawing_residual]),
         lever=lever,
-        landmarks=np.concatenate([columns, moved_in_drawing]),
-        noise=np.concatenate([noise, nothing]),
-        variance=np.concatenate([absent.astype(float), known]),
+        landmarks=np.concatenate([columns, drawing_columns]),
+        noise=np.concatenate([noise, np.zeros_like(drawing_residual)]),
+        variance=np.concatenate([absent.astype(float), drawing_variance]),
         positions=3 * s.used.shape[1],
         places=landmarks,
     )
@@ -215,18 +218,18 @@ def _coordinate_rows(
         about the centre, and (V, 3S, U) per unknown of the landmarks. Zeros where a view does not show a target.
     """
     V, S = s.used.shape
-    known = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
-    left = (frames.transform(poses, s.points) - known).reshape(V, -1)
+    places = np.nan_to_num(landmarks.positions)[np.maximum(s.target, 0)]
+    residual = (frames.transform(poses, s.points) - places).reshape(V, -1)
     noise = np.repeat(np.where(s.used, s.sigma**2, 0.0), 3, axis=1)
     # At the landmark, not where the view puts it: a turn of all views must look exactly as the same turn of the
     # landmarks does, or what is left would lend itself to parameters that nothing shows. The normal equations agree.
-    turned = -frames.skew(known - centre).reshape(V, -1, 3)
-    lever = np.concatenate([turned, np.tile(np.eye(3), (V, S, 1))], axis=2)
+    per_rotation = -frames.skew(places - centre).reshape(V, -1, 3)
+    lever = np.concatenate([per_rotation, np.tile(np.eye(3), (V, S, 1))], axis=2)
     columns = np.zeros((V, 3 * S, landmarks.size))
     v, slot = np.nonzero(s.used)
     for axis in range(3):
         columns[v, 3 * slot + axis, 3 * s.target[v, slot] + axis] = -1.0
-    return left, noise, lever, columns
+    return residual, noise, lever, columns
 
 
 def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
@@ -235,15 +238,15 @@ def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple
     Zeros where nobody knows how the probe is held.
     """
     V, at = len(poses), landmarks.positions.size
-    left, noise = np.zeros((V, 3)), np.zeros((V, 3))
+    residual, noise = np.zeros((V, 3)), np.zeros((V, 3))
     lever, columns = np.zeros((V, 3, 6)), np.zeros((V, 3, landmarks.size))
     if s.rotation is None or s.sigma_rotation is None or landmarks.orientation is None:
-        return left, noise, lever, columns
-    left = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
+        return residual, noise, lever, columns
+    residual = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
     noise[:] = np.where(s.used.any(axis=1), s.sigma_rotation**2, 0.0)[:, None]
     lever[..., :3] = np.eye(3)
     columns[..., at : at + 3] = -np.eye(3)
-    return left, noise, lever, columns
+    return residual, noise, lever, columns
 
 
 def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
@@ -254,16 +257,16 @@ def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
         the first three of m rows count, the others have unit variance.
     """
     count = 0 if landmarks.drawing is None else len(landmarks.drawing.target)
-    left, columns, fixed = np.zeros((count, m)), np.zeros((count, m, landmarks.size)), np.ones((count, m))
+    residual, columns, variance = np.zeros((count, m)), np.zeros((count, m, landmarks.size)), np.ones((count, m))
     if landmarks.drawing is None or landmarks.T_reference_part is None:
-        return left, columns, fixed
+        return residual, columns, variance
     placed = frames.transform(landmarks.T_reference_part, landmarks.drawing.points)
     for t, (k, p) in enumerate(zip(landmarks.drawing.target, placed, strict=True)):
-        left[t, :3] = landmarks.positions[k] - p
+        residual[t, :3] = landmarks.positions[k] - p
         columns[t, :3, 3 * k : 3 * k + 3] = np.eye(3)
         columns[t, :3, -6:] = np.hstack([frames.skew(p), -np.eye(3)])
-        fixed[t, :3] = landmarks.drawing.sigma[t] ** 2
-    return left, columns, fixed
+        variance[t, :3] = landmarks.drawing.sigma[t] ** 2
+    return residual, columns, variance
 
 
 def fit_landmarks(capture: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSquares, Array]:
@@ -291,6 +294,11 @@ def fit_landmarks(capture: Capture, T_mount: Array) -> tuple[Landmarks, BlockLea
 
 
 def landmarks_covariance(blocks: BlockLeastSquares, rows: TargetRows, hand_eye: Array) -> Array:
-    """(U, U) by the scatter of the poses, the sensor's noise and the uncertainty (6, 6) of the hand-eye."""
-    moved = blocks.shift_by_errors(rows.hand_eye)
-    return blocks.estimates_covariance() + moved @ hand_eye @ moved.T
+    """Return the covariance (U, U) of the landmarks by scatter of the poses, sensor's noise and the hand-eye.
+
+    Args:
+        blocks: the least squares problem of the landmarks.
+        hand_eye: (6, 6) covariance of T_mount·exp(ξ).
+    """
+    per_twist = blocks.shift_by_errors(rows.hand_eye)
+    return blocks.estimates_covariance() + per_twist @ hand_eye @ per_twist.T

@@ -39,17 +39,17 @@ class TargetModelFit(Value):
 
     @property
     def rms(self) -> float:
-        """Root mean square, in 3D, over all targets of all views."""
+        """Root mean square of `distances`, length_unit."""
         return rms_of(self.distances)
 
     @property
     def heldout_rms(self) -> float:
-        """The same for targets predicted without their own views."""
+        """Root mean square of `heldout`, length_unit."""
         return rms_of(self.heldout)
 
     @property
     def noise_floor(self) -> float:
-        """What the sensor's own noise would leave of it if every pose were perfect."""
+        """Rms 3D distance, length_unit, that the sensor's own noise would leave if every pose were perfect."""
         noise = self.rows.noise[: len(self.rows.lever), : self.rows.positions]
         return float(np.sqrt(3 * np.mean(noise[noise > 0])))
 
@@ -81,7 +81,7 @@ class TargetModelFit(Value):
 
     @property
     def landmark_sigmas(self) -> Array:
-        """(K, 3) of the targets' places."""
+        """(K, 3) standard deviations of the targets' places, length_unit."""
         K = len(self.landmarks.positions)
         return np.sqrt(np.maximum(np.diag(self.landmarks_covariance)[: 3 * K], 0)).reshape(K, 3)
 
@@ -90,7 +90,7 @@ class TargetModelFit(Value):
 
 
 def rms_of(distances: Array) -> float:
-    """Root mean square, NaN left out."""
+    """Return the root mean square of distances, NaN left out."""
     return float(np.sqrt(np.nanmean(distances**2)))
 
 
