@@ -54,9 +54,14 @@ _CONVERGED = 0.05
 # The effect that is the scanner's scale.
 _SCALE = "range_scale"
 
-# Which parameters (P,) are fitted, the rms (P,) that those at zero may well have, and by source, per session, twists
-# (6V, K) by the scanner's errors that all views repeat.
-Choice = tuple[Mask, Array, dict[str, list[Array]]]
+
+@dataclass(frozen=True)
+class Choice:
+    """What a step fits, and which errors its covariance counts."""
+
+    fitted: Mask  # (P,) parameters that are fitted
+    omitted: Array  # (P,) rms that parameters left at zero may have, each in its unit; 0 for all others
+    scanner_errors: dict[str, list[Array]]  # by source, per session, left twists (6V, K) per sigma of shared errors
 
 
 def fit_surfaces(
@@ -91,14 +96,13 @@ def fit_surfaces(
     step = linearised.solve(choice, prior_pose_errors(measurements, linearised.model, centres))
     hand_eye = step.solution
     terms = step.model.terms
-    fitted = choice[0]
-    sigmas = known_sigmas(terms, fitted, hand_eye.values_sigma)
+    sigmas = known_sigmas(terms, choice.fitted, hand_eye.values_sigma)
     kept = kept_root(terms, model.effects_covariance)
     model = replace(
         step.model,
         terms=with_parameter_values(terms, values_of(terms), sigmas),
         effects_covariance=covariance_of_fit(
-            terms, fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
+            terms, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
         ),
     )
     captures, unconstrained = _free_views(measurements, model, [f.overlaps.gate for f in linearised.unconstrained])
@@ -122,10 +126,10 @@ class LinearisedSurfaces:
     model: Model
     captures: tuple[Capture, ...]
     unconstrained: list[UnconstrainedPoses]
-    columns: list[Array]  # per session (6V, P)
+    columns: list[Array]  # per session (6V, P) left twists of the views per unit of each parameter
 
     def choose(self, before: Choice | None) -> Choice:
-        """Return the parameters to fit, the rms of those left at zero, and the scanner's errors: see `Choice`.
+        """Return the parameters to fit, the rms of those left at zero, and the scanner's errors.
 
         An effect in use that is the scanner's scale replaces the error of that scale, else it would count twice.
 
@@ -134,20 +138,20 @@ class LinearisedSurfaces:
         """
         scanner_errors = rig_scanner_errors(self.measurements, self.unconstrained)
         # Effects may be of one scanner among several, NAME@SCANNER: then only that one's column goes.
-        of_scale = [term.effect for term in self.model.terms if term.name.partition("@")[0] == _SCALE]
-        if any(not effect.scanner for effect in of_scale):
+        scale_effects = [term.effect for term in self.model.terms if term.name.partition("@")[0] == _SCALE]
+        if any(not effect.scanner for effect in scale_effects):
             del scanner_errors[SCANNER_SCALE]
-        elif of_scale:
-            of_each = zip(self.measurements, scanner_errors[SCANNER_SCALE], strict=True)
-            named = {effect.scanner for effect in of_scale}
+        elif scale_effects:
+            fitted_scanners = {effect.scanner for effect in scale_effects}
             scanner_errors[SCANNER_SCALE] = [
-                scale[:, [name not in named for name in m.views.scanners.names]] for m, scale in of_each
+                columns[:, [name not in fitted_scanners for name in m.views.scanners.names]]
+                for m, columns in zip(self.measurements, scanner_errors[SCANNER_SCALE], strict=True)
             ]
         held = self._held
-        fitted = np.zeros(len(held), bool) if before is None else before[0]
+        fitted = np.zeros(len(held), bool) if before is None else before.fitted
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
         omitted = omitted_rms(self._whitened(fitted), sizes_of(self.model.terms), fitted, self._effect_of_parameter)
-        return fitted, np.where(held | self._is_gauge, 0.0, omitted), scanner_errors
+        return Choice(fitted, np.where(held | self._is_gauge, 0.0, omitted), scanner_errors)
 
     def solve(self, choice: Choice, errors: PoseErrors | None = None) -> "SurfaceStep":
         """Return the step of hand-eye and chosen parameters by generalised least squares; those not chosen become zero.
@@ -156,7 +160,7 @@ class LinearisedSurfaces:
             choice: as `choose` returned it.
             errors: pose errors beside white scatter that the covariance counts; None: there are none.
         """
-        fitted = choice[0]
+        fitted = choice.fitted
         terms = self.model.terms
         before = values_of(terms)
         effects = FittedEffects(
@@ -183,15 +187,11 @@ class LinearisedSurfaces:
 
         Sources are the scanner, each effect whose parameters are left at zero though they may not be, and the
         uncertainty of another run's arm.
-
-        Args:
-            choice: parameters that are fitted; the rms (P,) that those left at zero may have; the scanner's errors.
         """
-        _, omitted, scanner_errors = choice
         terms = self.model.terms
-        errors = dict(scanner_errors)
+        errors = dict(choice.scanner_errors)
         for k, term in enumerate(terms):
-            sizes = omitted * (self._effect_of_parameter == k)
+            sizes = choice.omitted * (self._effect_of_parameter == k)
             if sizes.any():
                 errors[unfitted(term.name)] = [c[:, sizes > 0] * sizes[sizes > 0] for c in self.columns]
         # (P, K) root of the covariance of parameters that come from another run's arm.
@@ -223,9 +223,11 @@ class LinearisedSurfaces:
 
     @property
     def _held(self) -> Mask:
+        """(P,) mask of the parameters that keep their values: they are not fitted."""
         return np.array([p.held for p in stack_parameters(self.model.terms)], bool)
 
     def _whitened(self, free: Mask) -> WhitenedData:
+        """Return the whitened data of all sessions, the scatter estimated with the `free` parameters (P,) fitted."""
         sessions = list(zip(self.captures, self.unconstrained, self.columns, strict=True))
         return whiten_captures(sessions, self.model.T_mount, values_of(self.model.terms), free)
 

@@ -53,7 +53,7 @@ class Term(Value):
 
     @property
     def is_geometry(self) -> bool:
-        """True if it says where something stands and not what goes wrong: in every model that can have it."""
+        """True if it says where something stands, not what goes wrong: every model that can have it has it."""
         return self.effect.tier == "geometry"
 
     @property
@@ -74,12 +74,12 @@ class Term(Value):
 
     @property
     def typical(self) -> Array:
-        """(P,) plausible sizes."""
+        """(P,) plausible sizes, each in its parameter's unit."""
         return sizes_of([self])
 
     @property
     def gridded(self) -> Mask:
-        """(P,) bool: tried value by value instead of fitted."""
+        """(P,) mask of the parameters that are tried value by value instead of fitted."""
         return np.array([bool(p.grid) for p in self.parameters], bool)
 
     @cached_property
@@ -116,27 +116,25 @@ class EffectsCovariance:
         Rows of parameters that were not fitted are zero. A parameter whose sigma differs from that of the matrix, as
         one that a person edited in model.toml, counts with its own sigma and without correlation.
         """
-        rows = [(f"{term.name}.{p.name}", p) for term in terms for p in term.parameters]
-        at = {name: k for k, name in enumerate(self.names)}
+        parameters = [(f"{term.name}.{p.name}", p) for term in terms for p in term.parameters]
+        index = {name: k for k, name in enumerate(self.names)}
         sigma = np.sqrt(np.diag(self.matrix))
-        # Index among the parameters, and in the matrix, of those whose sigma is that of the matrix.
-        known = [
-            (i, at[name])
-            for i, (name, p) in enumerate(rows)
-            if name in at and p.fitted and abs(p.sigma - sigma[at[name]]) <= _SAME_SIGMA * sigma[at[name]]
-        ]
-        correlated = {i for i, _ in known}
-        single = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in correlated]
-        out = np.zeros((len(rows), len(known) + len(single)))
-        if known:
-            rows_known = [i for i, _ in known]
-            columns = [k for _, k in known]
-            size = sigma[columns]
-            values, vectors = np.linalg.eigh(self.matrix[np.ix_(columns, columns)] / np.outer(size, size))
-            out[rows_known, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        for k, i in enumerate(single, len(known)):
-            out[i, k] = rows[i][1].sigma
-        return out
+        # Number of each parameter whose sigma is that of the matrix, and its index there.
+        correlated = {
+            i: index[name]
+            for i, (name, p) in enumerate(parameters)
+            if name in index and p.fitted and abs(p.sigma - sigma[index[name]]) <= _SAME_SIGMA * sigma[index[name]]
+        }
+        uncorrelated = [i for i, (_, p) in enumerate(parameters) if p.fitted and i not in correlated]
+        L = np.zeros((len(parameters), len(correlated) + len(uncorrelated)))
+        if correlated:
+            columns = list(correlated.values())
+            unit = sigma[columns]
+            values, vectors = np.linalg.eigh(self.matrix[np.ix_(columns, columns)] / np.outer(unit, unit))
+            L[list(correlated), : len(correlated)] = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        for column, i in enumerate(uncorrelated, len(correlated)):
+            L[i, column] = parameters[i][1].sigma
+        return L
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,7 @@ def grid_terms(measurement: Measurement, effect: Effect) -> list[Term]:
 
 
 def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:
-    """Return all parameters of all terms in one row."""
+    """Return all parameters of all terms, term after term."""
     return tuple(p for term in terms for p in term.parameters)
 
 
@@ -240,7 +238,7 @@ def values_of(terms: Sequence[Term]) -> Array:
 
 
 def sizes_of(terms: Sequence[Term]) -> Array:
-    """Return (P,) plausible sizes of the same."""
+    """Return (P,) plausible sizes of all parameters of all terms, each in its unit."""
     return np.array([p.typical for p in stack_parameters(terms)], float)
 
 
@@ -253,9 +251,9 @@ def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
         fitted: (P,) True for the K parameters in the fit.
         sigmas: (K,) of these.
     """
-    out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
-    out[fitted] = sigmas
-    return out
+    all_sigmas = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
+    all_sigmas[fitted] = sigmas
+    return all_sigmas
 
 
 def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
@@ -279,29 +277,34 @@ def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
 
 
 def covariance_of_fit(
-    terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array, with_hand_eye: Array | None = None
+    terms: Sequence[Term],
+    fitted: Mask,
+    fitted_covariance: Array,
+    kept_root: Array,
+    with_hand_eye: Array | None = None,
 ) -> EffectsCovariance:
     """Return the covariance of the P parameters of effects: of those fitted, and of those kept from another run.
 
+    Parameters of zero variance, which are neither, are not in it.
+
     Args:
-        fitted: (P,) bool, K of them.
-        matrix: (K, K) their covariance.
-        kept: (P, L) root of the covariance of those kept: zero rows for the others.
-        with_hand_eye: (6, 6 + K) covariance of the hand-eye's twist with itself and with those fitted; stored only with
-            terms of tier geometry, whose places depend on both.
+        fitted: (P,) mask of the K parameters that were fitted.
+        fitted_covariance: (K, K) of these.
+        kept_root: (P, L) root of the covariance of those kept, as `kept_root` returns it; zero rows for the others.
+        with_hand_eye: (6, 6 + K) covariance of the hand-eye's twist ξ, T_mount·exp(ξ), with itself and with those
+            fitted; stored only with terms of tier geometry, whose places depend on both. None: it is not known.
     """
     names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
-    of_all = kept @ kept.T
-    of_all[np.ix_(fitted, fitted)] += matrix
-    known = np.diag(of_all) > 0
-    covariance = EffectsCovariance(
-        tuple(n for n, k in zip(names, known, strict=True) if k), of_all[np.ix_(known, known)]
-    )
+    covariance = kept_root @ kept_root.T
+    covariance[np.ix_(fitted, fitted)] += fitted_covariance
+    present = np.diag(covariance) > 0
+    names_present = tuple(name for name, is_present in zip(names, present, strict=True) if is_present)
+    of_effects = EffectsCovariance(names_present, covariance[np.ix_(present, present)])
     if with_hand_eye is None or not any(term.is_geometry for term in terms):
-        return covariance
-    beside = np.zeros((6, len(names)))
-    beside[:, fitted] = with_hand_eye[:, 6:]
-    return replace(covariance, with_hand_eye=np.hstack([with_hand_eye[:, :6], beside[:, known]]))
+        return of_effects
+    cross_covariance = np.zeros((6, len(names)))
+    cross_covariance[:, fitted] = with_hand_eye[:, 6:]
+    return replace(of_effects, with_hand_eye=np.hstack([with_hand_eye[:, :6], cross_covariance[:, present]]))
 
 
 def printed_covariance(T_mount: Array, covariance: Array) -> Array:

@@ -230,6 +230,7 @@ class MeanSums:
 
     @cached_property
     def _turned(self) -> list[Array]:
+        """The turned columns of all sets, as `CommonCovariance.turned`, joined group by group."""
         return [np.concatenate(parts) for parts in zip(*map(self.common.turned, self.sets), strict=True)]
 
     def products_with_further(self, sets: Sequence[SelectedColumns]) -> Array:
@@ -244,12 +245,12 @@ class MeanSums:
         rows = [np.concatenate([self.common.products(one, other) for other in sets], axis=2) for one in sets]
         a, g = across.shape[1] - 1, across.shape[2]
         old, new = np.append(np.arange(a), a + g), slice(a, a + g)
-        every = np.empty((len(across), a + g + 1, a + g + 1))
-        every[:, old[:, None], old] = self.products
-        every[:, old, new] = across
-        every[:, new, old] = across.transpose(0, 2, 1)
-        every[:, new, new] = np.concatenate(rows, axis=1)
-        return every
+        products = np.empty((len(across), a + g + 1, a + g + 1))
+        products[:, old[:, None], old] = self.products
+        products[:, old, new] = across
+        products[:, new, old] = across.transpose(0, 2, 1)
+        products[:, new, new] = np.concatenate(rows, axis=1)
+        return products
 
 
 def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
@@ -263,10 +264,11 @@ def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
     out = []
     for x, y in zip(X, Y, strict=True):
         (k, r, n), q = x.shape, len(y)
-        every = (x.reshape(k * r, n) @ y.reshape(q * r, n).T).reshape(k, r, q, r).transpose(1, 3, 0, 2)
+        # Σ_b x_bi y_bj for all i and j: (r, r, k, q).
+        products = (x.reshape(k * r, n) @ y.reshape(q * r, n).T).reshape(k, r, q, r).transpose(1, 3, 0, 2)
         for i in range(r):
-            pairs = every[i, i:].copy()
-            pairs[1:] += every[i + 1 :, i]
+            pairs = products[i, i:].copy()
+            pairs[1:] += products[i + 1 :, i]
             out.append(pairs)
     return np.concatenate(out)
 
@@ -285,22 +287,22 @@ def common_covariance(scattered: Sequence[Array], noise: Array, known: Array) ->
     """
     per_noise = np.where(noise > 0, noise, np.inf) ** -0.5
     per_known = np.where(known > 0, known, np.inf) ** -0.5
-    whole = np.concatenate(scattered, axis=2)
-    J = whole * per_noise[: len(whole), :, None]
-    patterns, which = np.unique(noise[: len(J)], axis=0, return_inverse=True)
+    all_axes = np.concatenate(scattered, axis=2)
+    J = all_axes * per_noise[: len(all_axes), :, None]
+    patterns, pattern = np.unique(noise[: len(J)], axis=0, return_inverse=True)
     # A number without noise that scatters all the same fits into no group.
-    if len(J) < MANY_BLOCKS or len(patterns) * _BLOCKS_A_GROUP > len(J) or whole[J == 0].any():
+    if len(J) < MANY_BLOCKS or len(patterns) * _BLOCKS_A_GROUP > len(J) or all_axes[J == 0].any():
         return None
     component = np.repeat(np.arange(len(scattered)), [per_unit.shape[2] for per_unit in scattered])
     groups = []
     for k in range(len(patterns)):
-        group = _group_of(J, np.flatnonzero(which.ravel() == k), component)
+        group = _group_of(J, np.flatnonzero(pattern.ravel() == k), component)
         if group is None:
             return None
         groups.append(group)
-    scatter = sum(len(group.blocks) * group.turn.shape[1] for group in groups)
-    log_units = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
-    return CommonCovariance(groups, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
+    turned_count = sum(len(group.blocks) * group.turn.shape[1] for group in groups)
+    logdet = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
+    return CommonCovariance(groups, per_noise, per_known, int((noise > 0).sum()) - turned_count, logdet)
 
 
 def _group_of(J: Array, blocks: Indices, component: Indices) -> CovarianceGroup | None:
@@ -315,12 +317,12 @@ def _group_of(J: Array, blocks: Indices, component: Indices) -> CovarianceGroup 
         blocks: (n,) which of the V.
         component: (s,) index of the component of the covariance that each axis belongs to.
     """
-    every = J[blocks].transpose(0, 2, 1) @ J[blocks]
+    G = J[blocks].transpose(0, 2, 1) @ J[blocks]
     # Axes count in rad and length_unit: all is done in units in which G has a unit diagonal.
-    size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
-    if (np.abs(every - every[0]) > _SAME * np.outer(size, size)).any():
+    size = np.sqrt(np.maximum(np.diag(G[0]), 1e-300))
+    if (np.abs(G - G[0]) > _SAME * np.outer(size, size)).any():
         return None
-    values, vectors = np.linalg.eigh(every[0] / np.outer(size, size))
+    values, vectors = np.linalg.eigh(G[0] / np.outer(size, size))
     keep = values > _NO_DIRECTION * max(values[-1], 1e-300)
     if not (values[keep] > _PRECISE * values[-1]).all():
         return None

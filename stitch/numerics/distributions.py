@@ -15,7 +15,7 @@ TUKEY = 4.685
 
 
 def mad_sigma(e: Array) -> float:
-    """Robust sigma 1.4826 × median |e| of residuals (N,) that are symmetric about zero."""
+    """Return the robust sigma, 1.4826 × median |e|, of residuals (N,) that are symmetric about zero."""
     return MAD_TO_SIGMA * float(np.median(np.abs(e)))
 
 
@@ -36,17 +36,17 @@ def tukey(e: Array, scale: float) -> Array:
 
 
 def chi2_tail(x: float, degrees: float) -> float:
-    """P(χ²_degrees > x)."""
+    """Return P(χ² > x) for a χ² of so many degrees of freedom."""
     return float(special.chdtrc(degrees, x))
 
 
 def chi2_limit(p: float, degrees: float) -> float:
-    """The χ² that a share p exceeds."""
+    """Return the value that a χ² of so many degrees of freedom exceeds with probability p."""
     return float(special.chdtri(degrees, p))
 
 
 def normal_tail(x: float) -> float:
-    """P(N(0, 1) > x)."""
+    """Return P(N(0, 1) > x)."""
     return float(special.ndtr(-x))
 
 
@@ -60,17 +60,17 @@ def sigmas_among(sigmas: float, count: int) -> float:
 
 
 def binomial_tail(x: int, count: int, share: float) -> float:
-    """P(X > x) of so many trials with a chance each."""
+    """Return P(X > x) for the number X of successes in `count` trials, each with probability `share`."""
     return float(special.bdtrc(x, count, share))
 
 
 def f_tail(x: float, numerator: float, denominator: float) -> float:
-    """P(F > x) with degrees of freedom of numerator and denominator."""
+    """Return P(F > x) of the F distribution with these degrees of freedom."""
     return float(special.fdtrc(numerator, denominator, x))
 
 
 def f_limit(p: float, numerator: float, denominator: float) -> float:
-    """The F that a share p exceeds."""
+    """Return the value that F, with these degrees of freedom, exceeds with probability p."""
     return float(f_limits(np.array(p), numerator, denominator))
 
 
@@ -84,5 +84,5 @@ def f_limits(p: Array, numerator: float, denominator: float) -> Array:
 
 
 def noncentral_f_tail(x: float, numerator: float, denominator: float, shift: float) -> float:
-    """P(F > x) of the noncentral F distribution with noncentrality `shift`."""
+    """Return P(F > x) of the noncentral F distribution with noncentrality `shift`."""
     return float(1 - special.ncfdtr(numerator, denominator, shift, x))

@@ -36,10 +36,12 @@ def align_points(points: Array, targets: Array, weights: Array | None = None) ->
     """
     share = np.full(points.shape[-2], 1.0) if weights is None else weights
     share = (share / share.sum())[:, None]
-    middle, there = ((share * x).sum(axis=-2) for x in (points, targets))
-    across = np.swapaxes(share * (targets - there[..., None, :]), -1, -2) @ (points - middle[..., None, :])
-    R = frames.nearest_rotation(across)
-    return frames.make(R, there - (R @ middle[..., None])[..., 0])
+    mean_point, mean_target = ((share * x).sum(axis=-2) for x in (points, targets))
+    covariance = np.swapaxes(share * (targets - mean_target[..., None, :]), -1, -2) @ (
+        points - mean_point[..., None, :]
+    )
+    R = frames.nearest_rotation(covariance)
+    return frames.make(R, mean_target - (R @ mean_point[..., None])[..., 0])
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,11 @@ def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurfac
     point, column = np.nonzero(np.isfinite(distance) & (distance > 0))
     neighbour = index[point, column].astype(int)
     # `point` and `neighbour` (P,) list all pairs; each point's query also found the point itself, at distance 0.
-    simple = _angle_histograms(points, normals, point, neighbour)
+    own = _angle_histograms(points, normals, point, neighbour)
     weight = 1 / distance[point, column] ** 2
-    sums = [np.bincount(point, weight * share[neighbour], len(points)) for share in simple.T]
-    around: Array = np.stack(sums, axis=1).astype(float)
-    return FeaturedSurface(points, normals, _normalised(simple) + _normalised(around), tree)
+    sums = [np.bincount(point, weight * of_bin[neighbour], len(points)) for of_bin in own.T]
+    of_neighbours: Array = np.stack(sums, axis=1).astype(float)
+    return FeaturedSurface(points, normals, _normalised(own) + _normalised(of_neighbours), tree)
 
 
 def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: float, draws: int, seed: int = 0) -> Array:
@@ -186,6 +188,7 @@ def _normalised(histograms: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
+    """Return vectors (N, 3) divided by their lengths; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
@@ -194,10 +197,11 @@ def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
 
     Where they are fewer than three triples need: each of a, and its nearest of b.
     """
-    forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
-    every = np.arange(len(a))
-    mutual = back[forth] == every
-    return (every[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (every, forth)
+    nearest_in_b = KDTree(b).query(a, k=1)[1].astype(int)
+    nearest_in_a = KDTree(a).query(b, k=1)[1].astype(int)
+    index = np.arange(len(a))
+    mutual = nearest_in_a[nearest_in_b] == index
+    return (index[mutual], nearest_in_b[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (index, nearest_in_b)
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:

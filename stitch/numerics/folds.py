@@ -30,7 +30,7 @@ class JointEnd:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """The end in words: the highest or lowest fifth of a joint, counted from 1."""
         return f"the {'highest' if self.upper else 'lowest'} fifth of joint {self.joint + 1}"
 
 

@@ -20,7 +20,7 @@ _SMALL_ANGLE = 1e-3
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrices: `skew(v) @ w == cross(v, w)`; (..., 3) -> (..., 3, 3)."""
+    """Return cross-product matrices (..., 3, 3) of vectors (..., 3): `skew(v) @ w == cross(v, w)`."""
     v = np.asarray(v, float)
     out = np.zeros((*v.shape, 3))
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
@@ -28,7 +28,7 @@ def skew(v: Array) -> Array:
 
 
 def make(rotation: Array, translation: Array) -> Array:
-    """4x4 transforms from rotation matrices (..., 3, 3) and translations (..., 3)."""
+    """Return transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3)."""
     rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     T = np.zeros((*shape, 4, 4))
@@ -47,7 +47,7 @@ def _left_jacobian_terms(angle: Array) -> tuple[Array, Array]:
 
 
 def exp(xi: Array) -> Array:
-    """Exponential of twists (..., 6) -> transforms (..., 4, 4).
+    """Return transforms (..., 4, 4), the exponential of twists (..., 6).
 
     R = 1 + sin θ/θ r̂ + (1 − cos θ)/θ² r̂² and t = V ρ with V = 1 + (1 − cos θ)/θ² r̂ + (θ − sin θ)/θ³ r̂², for the
     rotation vector r of length θ, its cross-product matrix r̂, and the translation part ρ.
@@ -66,7 +66,7 @@ def exp(xi: Array) -> Array:
 
 
 def log(T: Array) -> Array:
-    """Logarithm of transforms (..., 4, 4) -> twists (..., 6), the inverse of `exp`; rotation angle in [0, π]."""
+    """Return twists (..., 6), the logarithm of transforms (..., 4, 4): inverse of `exp`, rotation angle in [0, π]."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
     rotation = rotations(R).as_rotvec().reshape(*R.shape[:-2], 3)
@@ -79,13 +79,13 @@ def log(T: Array) -> Array:
 
 
 def inverse(T: Array) -> Array:
-    """Inverse of rigid transforms (..., 4, 4), without a general matrix inverse."""
+    """Return the inverses of rigid transforms (..., 4, 4), without a general matrix inverse."""
     Rt = np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2)
     return make(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
 
 
 def adjoint(T: Array) -> Array:
-    """(..., 6, 6) with `T · exp(ξ) · T⁻¹ = exp(adjoint(T) @ ξ)`, rotation-first twists."""
+    """Return matrices (..., 6, 6) with `T · exp(ξ) · T⁻¹ = exp(adjoint(T) @ ξ)`, for transforms T (..., 4, 4)."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
@@ -147,7 +147,7 @@ def plane_rows(arms: Array, normals: Array) -> Array:
 
 
 def from_quaternion(position: Array, quaternion: Array) -> Array:
-    """Poses (..., 4, 4) from positions (..., 3) and quaternions (..., 4), order x, y, z, w, of any length but zero."""
+    """Return poses (..., 4, 4) from positions (..., 3) and quaternions (..., 4): x, y, z, w, of any length but 0."""
     x, y, z, w = np.moveaxis(np.asarray(quaternion, float), -1, 0)
     length = np.sqrt(x * x + y * y + z * z + w * w)
     x, y, z, w = x / length, y / length, z / length, w / length
@@ -160,7 +160,7 @@ def from_quaternion(position: Array, quaternion: Array) -> Array:
 
 
 def to_quaternion(T: Array) -> Array:
-    """Quaternions (..., 4) in the order x, y, z, w, with w ≥ 0."""
+    """Return quaternions (..., 4) of transforms (..., 4, 4), in the order x, y, z, w, with w ≥ 0."""
     R = np.asarray(T, float)[..., :3, :3]
     quaternion = rotations(R).as_quat(canonical=True)
     return quaternion.reshape(*R.shape[:-2], 4)
@@ -177,7 +177,7 @@ def rotations(R: Array) -> Any:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotations (..., 3, 3) closest to matrices (..., 3, 3) in the Frobenius norm (polar factor by SVD)."""
+    """Return the rotations (..., 3, 3) closest to matrices (..., 3, 3) in the Frobenius norm: polar factors by SVD."""
     U, _, Vt = np.linalg.svd(np.asarray(matrix, float))
     # An improper factor, of determinant −1, loses least when the direction of the smallest singular value is reversed.
     sign = np.linalg.det(U @ Vt)
@@ -187,7 +187,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
-    """True if one matrix (4, 4) is a proper rigid motion within `tolerance`."""
+    """Return True if a matrix (4, 4) is a proper rigid motion within `tolerance`."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
@@ -197,7 +197,7 @@ def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
 
 
 def angle_between(T_a: Array, T_b: Array) -> Array:
-    """(...,) rotation angle (rad) between transforms (..., 4, 4)."""
+    """Return the rotation angles (...,) rad between transforms (..., 4, 4)."""
     R = np.swapaxes(np.asarray(T_a, float)[..., :3, :3], -1, -2) @ np.asarray(T_b, float)[..., :3, :3]
     # R − Rᵀ holds 2 sin θ, the trace 1 + 2 cos θ: together exact at every angle, as the arccosine is not.
     twice_sine = np.linalg.norm([R[..., i, j] - R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=0)

@@ -45,8 +45,13 @@ def joint_kernel_factors(some: Array, others: Array, reach: float = REACH) -> Ar
 
 
 def short_range_kernel(some: Array, others: Array) -> Array:
-    """Return covariances (S, O) of a random function of one joint's angle, (S,) and (O,) rad, that may change within
-    a few degrees: a Gaussian on the circle of reach `SHORT_REACH`."""
+    """Return covariances (S, O) of a random function of one joint's angle that may change within a few degrees.
+
+    A Gaussian on the circle of reach `SHORT_REACH`.
+
+    Args:
+        some, others: (S,) and (O,) angles, rad.
+    """
     return 2 * joint_kernel_factors(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1
 
 
@@ -103,7 +108,7 @@ def load_kernel(torques: Array) -> Array:
 
 
 def direction_reach(joint: Array) -> float:
-    """How far a move may differ and still do nearly the same, rad: the range of the joint (V,) rad."""
+    """Return how far a move may differ and still have nearly the same effect, rad: the range of the joint (V,) rad."""
     return max(float(np.ptp(joint)), 1e-9)
 
 
@@ -121,7 +126,7 @@ def same_stop(T_base_flange: Array) -> Mask:
 
 @dataclass(frozen=True)
 class SmoothErrors:
-    """Errors f_p(view)·column_p of all poses by P smooth random functions f_p, each of one joint.
+    """Errors of all poses by P smooth random functions of the views, each of one joint: twists f_p(view)·column_p.
 
     Of several of one joint at most one is in the model at a time.
     """
@@ -137,11 +142,11 @@ class SmoothErrors:
         return [p for p, of_process in enumerate(self.joints) if of_process == joint]
 
     def twist_covariance(self, process: int) -> Array:
-        """(6V, 6V) covariance of the twists by one process alone."""
+        """Return the covariance (6V, 6V) of the twists by one process alone, given by its index."""
         return process_covariance(self.columns[:, [process]], self.kernel_of(process))
 
     def kernel_of(self, process: int) -> Array:
-        """(V, V) covariance of a process."""
+        """Return the covariance (V, V) between views of a process, given by its index."""
         return self.kernel if self.kernel.ndim == 2 else np.asarray(self.kernel[process])
 
 

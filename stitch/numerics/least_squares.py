@@ -21,9 +21,9 @@ _SOLVABLE = 1e-6
 _MANY_ROWS, _SAYS_SOMETHING, _SAYS_NOTHING = 1_000, 1e-8, 1e-12
 # Of blocks of more numbers a library's loop takes a third of the time, of 264 a seventh.
 _LARGE_BLOCK = 96
-# Fewer estimates say nothing about their spread.
+# Fewer estimates with a group left out say nothing about their spread.
 _FEWEST = 4
-# Acceleration against steps that hardly shrink: at most twice as far, or half as far where they turn back.
+# Anderson's share by which a step is lengthened: at most twice as far, or half as far where steps turn back.
 _FARTHEST, _NEAREST = 1.0, -0.5
 
 
@@ -42,7 +42,7 @@ def equilibrated(matrix: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class InverseCovariance:
-    """Of a covariance V in B blocks of m."""
+    """The inverse of a covariance V that has B blocks of m numbers."""
 
     matrix: Array  # (B, m, m) V⁻¹
     half: Array  # (B, m, m) L⁻¹, lower, with V = L Lᵀ
@@ -155,11 +155,11 @@ class BlockLeastSquares:
             sums = sums - rows.T @ rows
         solutions = list[Array]()
         for precision, prior_vector in priors:
-            k = len(precision)
-            prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
+            p = len(precision)
+            Q, vector = np.diag(precision), sums[:p, -1] + prior_vector
             # Units from all blocks: what the blocks left out alone show must count as small in the rest.
-            unit = equilibrated(self._sums[:k, :k] + prior)[1]
-            solutions.append(solve_in_units(sums[:k, :k] + prior, vector, unit))
+            unit = equilibrated(self._sums[:p, :p] + Q)[1]
+            solutions.append(solve_in_units(sums[:p, :p] + Q, vector, unit))
         return solutions
 
     def estimates_covariance(self) -> Array:
@@ -275,14 +275,21 @@ def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Arra
 
 
 def symmetric_inverse(matrix: Array, relative: float = 1e-10) -> Array:
-    """(k, k) inverse of a symmetric matrix of mixed units; what nothing shows is zero in it."""
+    """Return the inverse (k, k) of a symmetric matrix of mixed units; zero in directions of almost no information.
+
+    Args:
+        relative: eigenvalues below this share of the largest, at unit diagonal, count as zero.
+    """
     return _pseudo_inverse(*equilibrated(matrix), relative)
 
 
 def summed_squares(blocks: Array) -> Array:
-    """(n, n) Σ_v B_v B_vᵀ of blocks (V, n, k): covariance of n numbers that V independent unit errors move.
+    """Return the covariance (n, n) of n numbers that V independent unit errors of k components move: Σ_v B_v B_vᵀ.
 
     One matrix product: with hundreds of views a sum over three indices takes a hundred times as long.
+
+    Args:
+        blocks: B (V, n, k).
     """
     wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
     return wide @ wide.T

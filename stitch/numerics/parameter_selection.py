@@ -19,11 +19,11 @@ from stitch.numerics.least_squares import equilibrated, project_out
 # How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each. A
 # mixture of normal distributions has tails that one of them has not (West 1987, Biometrika 74:646): a table of lengths
 # in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
-# What is grossly wrong: one effect of a hundred.
+# GROSS is the scale of what is grossly wrong: one effect of a hundred.
 GROSS, _GROSS_SHARE = 30.0, 0.01
-# Of plausible size, or grossly wrong.
+# Scale → weight, of amplitudes of plausible size or grossly wrong.
 PLAUSIBLE = {1.0: 1 - _GROSS_SHARE, GROSS: _GROSS_SHARE}
-# Of any size: what plausible sizes are is a guess.
+# The same where the plausible size is only a guess: from a tenth to three times it.
 ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _GROSS_SHARE) / 4) | {GROSS: _GROSS_SHARE}
 # Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
 _LOG_BAYES_FACTOR = 2.5
@@ -49,10 +49,10 @@ def log_evidence(information: Array, vector: Array, precision: Array | None = No
     # In units of the prior: amplitudes may differ by powers of ten.
     P, unit = equilibrated(np.eye(vector.shape[-1]) if precision is None else precision)
     m = np.zeros(len(unit)) if mean is None else mean / unit
-    both = information * np.outer(unit, unit) + P
-    pull = vector * unit + P @ m
-    square = np.sum(pull * np.linalg.solve(both, pull[..., None])[..., 0], axis=-1) - m @ P @ m
-    return 0.5 * (square - np.linalg.slogdet(both)[1] + np.linalg.slogdet(P)[1])
+    posterior = information * np.outer(unit, unit) + P
+    q = vector * unit + P @ m
+    square = np.sum(q * np.linalg.solve(posterior, q[..., None])[..., 0], axis=-1) - m @ P @ m
+    return 0.5 * (square - np.linalg.slogdet(posterior)[1] + np.linalg.slogdet(P)[1])
 
 
 def log_evidence_at_scales(information: Array, vector: Array, scales: dict[float, float]) -> Array:
@@ -63,18 +63,23 @@ def log_evidence_at_scales(information: Array, vector: Array, scales: dict[float
         vector: (k,) v of the log likelihood.
         scales: standard deviations; the weights of the mixture, its values, are not used here.
     """
-    out, k = np.zeros(len(scales)), len(vector)
+    logs, k = np.zeros(len(scales)), len(vector)
     for i, scale in enumerate(scales if k else ()):
-        both = scale**2 * information
-        both.flat[:: k + 1] += 1.0
-        root, _ = dpotrf(both, lower=1, clean=0)
-        half = dtrtrs(root, scale * vector, lower=1)[0]
-        out[i] = 0.5 * float(half @ half) - float(np.log(root.diagonal()).sum())
-    return out
+        # Precision of the posterior, with amplitudes in units of the prior's standard deviation.
+        posterior = scale**2 * information
+        posterior.flat[:: k + 1] += 1.0
+        L, _ = dpotrf(posterior, lower=1, clean=0)
+        white = dtrtrs(L, scale * vector, lower=1)[0]
+        logs[i] = 0.5 * float(white @ white) - float(np.log(L.diagonal()).sum())
+    return logs
 
 
 def log_mixture(logs: Array, scales: dict[float, float]) -> float:
-    """Log evidence over all scales from that of each (s,)."""
+    """Return the log evidence under a mixture of priors, from that under each of its scales, (s,).
+
+    Args:
+        scales: standard deviation → weight of the mixture, in the order of `logs`.
+    """
     return float(np.logaddexp.reduce(logs + np.log(list(scales.values()))))
 
 
@@ -97,8 +102,8 @@ def select_supported(
 ) -> Mask:
     """Return a mask (P,) of the parameters to fit: the set of groups with the greatest evidence that was found.
 
-    Forward selection followed by elimination, and elimination from all: the better of the two. An effect without a
-    chosen group gets its best one, since it was asked for.
+    The better of two searches: forward selection followed by elimination, and elimination from all groups. An effect
+    without a chosen group gets its best one, since it was asked for.
 
     Args:
         sizes: (P,) plausible sizes: standard deviations of the prior.
@@ -110,28 +115,28 @@ def select_supported(
     M, v = G.T @ G, G.T @ y
 
     @cache
-    def gain_of(*index: int) -> float:
+    def gain_of_parameters(*index: int) -> float:
         """Return the log Bayes factor, nats, of these parameters over none."""
         information, vector = M[np.ix_(index, index)], v[list(index)]
         return log_mixture(log_evidence_at_scales(information, vector, PLAUSIBLE), PLAUSIBLE)
 
     def gain(chosen: Sequence[int]) -> float:
         """Return the log Bayes factor, nats, of all parameters of these groups over none."""
-        return gain_of(*sorted({i for k in chosen for i in groups[k]}))
+        return gain_of_parameters(*sorted({i for k in chosen for i in groups[k]}))
 
-    every = list(range(len(groups)))
+    all_groups = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
-    ways = (eliminate_backward(gain, select_forward(gain, every)), eliminate_backward(gain, every))
-    chosen = max(ways, key=gain)
+    forward = eliminate_backward(gain, select_forward(gain, all_groups))
+    chosen = max((forward, eliminate_backward(gain, all_groups)), key=gain)
     seen = np.linalg.norm(G, axis=0) >= 1 / UNSEEN
     for effect in dict.fromkeys(effects):
         if not any(effects[k] == effect for k in chosen):
-            of_effect = [k for k in every if effects[k] == effect]
+            of_effect = [k for k in all_groups if effects[k] == effect]
             # A group of which the views show something goes before one that would only borrow from the hand-eye.
             chosen.append(max(of_effect, key=lambda k: (seen[groups[k]].any(), gain([*chosen, k]))))
-    out = np.zeros(len(sizes), bool)
-    out[[i for k in chosen for i in groups[k]]] = True
-    return out
+    selected = np.zeros(len(sizes), bool)
+    selected[[i for k in chosen for i in groups[k]]] = True
+    return selected
 
 
 def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Indices) -> Array:
@@ -151,16 +156,17 @@ def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Ind
         fitted: (P,) True for parameters in the fit.
         effects: (P,) index of the effect that each belongs to.
     """
-    information, pull = _marginal_information(whitened, sizes, fitted)
-    # From 0, unobserved, to 1; then twice: odds under the usual prior, and under the one that the others give.
+    information, vector = _marginal_information(whitened, sizes, fitted)
+    # How well the views show each, from 0 to 1: the weight of what it says of others.
     seen = information / (1 + information)
-    gain, square = _inclusion_odds(information, pull)
+    # First under the usual prior, then under the one that the others of the same effect give.
+    log_odds, square = _inclusion_odds(information, vector)
     others = np.equal.outer(effects, effects) & ~np.eye(len(sizes), dtype=bool)
-    there = seen * expit(gain)
-    share = (_EVEN_ODDS + others @ there) / (1 + others @ seen)
-    scale = np.sqrt((1 + others @ (there * square)) / (1 + others @ there))
-    gain, square = _inclusion_odds(scale**2 * information, scale * pull)
-    rms = sizes * scale * np.sqrt(expit(logit(share) + gain) * square)
+    present = seen * expit(log_odds)
+    share = (_EVEN_ODDS + others @ present) / (1 + others @ seen)
+    scale = np.sqrt((1 + others @ (present * square)) / (1 + others @ present))
+    log_odds, square = _inclusion_odds(scale**2 * information, scale * vector)
+    rms = sizes * scale * np.sqrt(expit(logit(share) + log_odds) * square)
     return np.where(fitted, 0.0, rms)
 
 
@@ -187,19 +193,19 @@ def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) ->
         fitted: (P,) True for parameters in the fit.
     """
 
-    def conditioned_on(others: Mask, asked: Mask) -> tuple[Array, Array]:
-        """Return both for the parameters `asked`, each alone beside the base and the parameters `others`."""
+    def beside(others: Mask, of: Mask) -> tuple[Array, Array]:
+        """Return I and v of the parameters `of`, each alone beside the base and the parameters `others`."""
         base = np.hstack([whitened.base, whitened.further[:, others]])
-        G = project_out(base, whitened.further[:, asked] * sizes[asked])
+        G = project_out(base, whitened.further[:, of] * sizes[of])
         y = project_out(base, whitened.z[:, None])[:, 0]
         return np.einsum("np,np->p", G, G), G.T @ y
 
-    information, pull = np.zeros(len(sizes)), np.zeros(len(sizes))
-    information[~fitted], pull[~fitted] = conditioned_on(fitted, ~fitted)
+    information, vector = np.zeros(len(sizes)), np.zeros(len(sizes))
+    information[~fitted], vector[~fitted] = beside(fitted, ~fitted)
     for p in np.flatnonzero(fitted):
         only = np.arange(len(sizes)) == p
-        information[only], pull[only] = conditioned_on(fitted & ~only, only)
-    return information, pull
+        information[only], vector[only] = beside(fitted & ~only, only)
+    return information, vector
 
 
 def select_forward(

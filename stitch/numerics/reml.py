@@ -51,6 +51,8 @@ _KNOWN = 1e-12
 _SPAN = (32.0, 14.0)
 _FACTORS = (float(np.log(0.3)), float(np.log(1e8)))
 _ABSENT = 1e-300
+# The second start of a fit: all variances but the noise's smaller by this, in the logarithm.
+_NEARLY_ABSENT = 9.0
 # The search ends where the deviance's slope is below the first; with thousands of numbers below the second: the
 # curvature grows with their count, and 0.1 then costs the deviance less than 1e-5.
 # Where further components may be absent, begun near the maximum, the third: their prior alone curves by 0.09, so that
@@ -94,15 +96,15 @@ def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float
     Args:
         further: prior of the components after NOISE; None: there are none.
     """
-    off = (log_variances[NOISE] - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD
-    value = -float(log_variances[:NOISE].sum()) + off**2
+    factor_sigmas = (log_variances[NOISE] - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD
+    value = -float(log_variances[:NOISE].sum()) + factor_sigmas**2
     slope = -np.ones(len(log_variances))
-    slope[NOISE] = 2 * off / FACTOR_SPREAD
+    slope[NOISE] = 2 * factor_sigmas / FACTOR_SPREAD
     if further is not None:
-        over = np.exp(log_variances[NOISE + 1 :]) / further.scales**2
+        ratio = np.exp(log_variances[NOISE + 1 :]) / further.scales**2
         a = further.shapes
-        value += float(((1 + a) * np.log1p(over) - a * log_variances[NOISE + 1 :]).sum())
-        slope[NOISE + 1 :] = (1 + a) * over / (1 + over) - a
+        value += float(((1 + a) * np.log1p(ratio) - a * log_variances[NOISE + 1 :]).sum())
+        slope[NOISE + 1 :] = (1 + a) * ratio / (1 + ratio) - a
     return value, slope
 
 
@@ -114,6 +116,7 @@ def log_density(component: int, log_variances: Array, further: FurtherPrior | No
 
     Args:
         component: index, NOISE or another.
+        further: prior of the components after NOISE; None: there are none.
     """
     if component == NOISE:
         return -0.5 * ((log_variances - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD) ** 2
@@ -125,12 +128,12 @@ def log_density(component: int, log_variances: Array, further: FurtherPrior | No
     else:
         scale = float(further.scales[component - NOISE - 1])
         a = float(further.shapes[component - NOISE - 1])
-    over = log_variances - 2 * np.log(scale)
-    out = 0.5 * a * over - 0.5 * (1 + a) * np.log1p(np.exp(over))
-    # Half a step of its own, and all that is below it: a beta distribution of x/(1 + x).
-    below = betaln(0.5 * a, 0.5) + np.log(betainc(0.5 * a, 0.5, expit(over[0])))
-    out[0] = np.logaddexp(out[0] - np.log(2), below - np.log(log_variances[1] - log_variances[0]))
-    return out
+    log_ratio = log_variances - 2 * np.log(scale)
+    density = 0.5 * a * log_ratio - 0.5 * (1 + a) * np.log1p(np.exp(log_ratio))
+    # The first point has half a step of its own, and all below it: x/(1 + x) has a beta distribution.
+    below = betaln(0.5 * a, 0.5) + np.log(betainc(0.5 * a, 0.5, expit(log_ratio[0])))
+    density[0] = np.logaddexp(density[0] - np.log(2), below - np.log(log_variances[1] - log_variances[0]))
+    return density
 
 
 def prior_information(variances: Array, further: FurtherPrior | None) -> Array:
@@ -138,12 +141,12 @@ def prior_information(variances: Array, further: FurtherPrior | None) -> Array:
 
     The scatter's prior is linear in the log variance: it has none.
     """
-    out = np.zeros(len(variances))
-    out[NOISE] = 1 / FACTOR_SPREAD**2
+    information = np.zeros(len(variances))
+    information[NOISE] = 1 / FACTOR_SPREAD**2
     if further is not None:
-        over = variances[NOISE + 1 :] / further.scales**2
-        out[NOISE + 1 :] = 0.5 * (1 + further.shapes) * over / (1 + over) ** 2
-    return out
+        ratio = variances[NOISE + 1 :] / further.scales**2
+        information[NOISE + 1 :] = 0.5 * (1 + further.shapes) * ratio / (1 + ratio) ** 2
+    return information
 
 
 def usual_variances(z: Array, components: Array) -> Array:
@@ -154,12 +157,12 @@ def usual_variances(z: Array, components: Array) -> Array:
         components: (c, B, m, m) of their covariance.
     """
     traces = np.einsum("cbii->c", components)
-    spread = float((z**2).sum()) or 1e-24
-    # What there is beside scatter and noise begins small: it is there only where the numbers ask for it.
+    sum_of_squares = float((z**2).sum()) or 1e-24
+    # Further components begin small: they grow where the observations ask for them.
     shares = np.where(np.arange(len(traces)) < NOISE, 0.25, 0.05)
-    guess = shares * spread / np.maximum(traces, 1e-300)
-    guess[NOISE] = 1.0
-    return guess
+    variances = shares * sum_of_squares / np.maximum(traces, 1e-300)
+    variances[NOISE] = 1.0
+    return variances
 
 
 @dataclass(frozen=True)
@@ -206,13 +209,13 @@ class FurtherColumns:
 
     @cached_property
     def G(self) -> Array:
-        """(B, m, g) the further columns."""
+        """(B, m, g) the further columns of all sets."""
         columns = [selected.columns for selected in self.sets]
         return np.hstack([np.zeros((self.mixed.z.size, 0)), *columns]).reshape(*self.mixed.z.shape, -1)
 
     @cached_property
     def Xz(self) -> Array:
-        """(B, m, a + g + 1) all columns of the mean, and z as the last one."""
+        """(B, m, a + g + 1) all columns of the mean, and the observations z as the last."""
         return np.concatenate([self.mixed.A, self.G, self.mixed.z[..., None]], axis=2)
 
     @cached_property
@@ -228,10 +231,9 @@ class FurtherColumns:
         A = np.concatenate([self.mixed.A, self.G], axis=2)
         if self.mixed.common is None:
             return replace(self.mixed, A=A)
-        *mean, seen = self.mixed.sums.sets
-        return replace(
-            self.mixed, A=A, known_sums=MeanSums(self.mixed.common, [*mean, *self.sets, seen], self.products)
-        )
+        *mean, z = self.mixed.sums.sets
+        sums = MeanSums(self.mixed.common, [*mean, *self.sets, z], self.products)
+        return replace(self.mixed, A=A, known_sums=sums)
 
 
 @dataclass(frozen=True)
@@ -244,7 +246,7 @@ class ModelInformation:
     mixed: MixedModel
     pairs: Array  # (t,) weight of every pair of turned numbers: entries of V⁻¹ (`common_covariance`)
     half: Array  # (a, r) square root of (XᵀV⁻¹X)⁻¹
-    seen: Array  # (r,) halfᵀXᵀV⁻¹z
+    z_explained: Array  # (r,) halfᵀXᵀV⁻¹z
 
     def of(self, columns: SelectedColumns) -> tuple[Array, Array]:
         """Return I (g, g) and v (g,) of the log likelihood vᵀθ − ½ θᵀIθ of the coefficients θ of g further columns G.
@@ -253,9 +255,11 @@ class ModelInformation:
         columns are cached.
         """
         common = self.mixed.sums.common
-        *mean, seen = (common.weighted(self.pairs, held, columns) for held in self.mixed.sums.sets)
-        known = self.half.T @ np.concatenate(mean)
-        return common.weighted(self.pairs, columns, columns) - known.T @ known, seen[0] - known.T @ self.seen
+        # XᵀV⁻¹G of each set of the model's columns, and zᵀV⁻¹G as the last.
+        *of_model, of_z = (common.weighted(self.pairs, columns_or_z, columns) for columns_or_z in self.mixed.sums.sets)
+        explained = self.half.T @ np.concatenate(of_model)
+        information = common.weighted(self.pairs, columns, columns) - explained.T @ explained
+        return information, of_z[0] - explained.T @ self.z_explained
 
 
 def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
@@ -314,7 +318,7 @@ class Likelihood:
 
     @property
     def covariance(self) -> Array:
-        """(a + g, a + g) of the coefficients."""
+        """(a + g, a + g) covariance of the mean's coefficients."""
         return self.half @ self.half.T
 
     @cached_property
@@ -334,16 +338,16 @@ class Likelihood:
         half_and_rest[:-1, -1] = -self.mean
         half_and_rest[-1, -1] = 1.0
         if isinstance(self.errors, PairWeights):
-            taken = np.tensordot(columns.products, half_and_rest @ half_and_rest.T)
-            slopes = self.errors.traces - self.errors.slopes @ taken
+            subtracted = np.tensordot(columns.products, half_and_rest @ half_and_rest.T)
+            slopes = self.errors.traces - self.errors.slopes @ subtracted
         else:
             blocks, m = mixed.z.shape
             slopes = np.zeros(len(mixed.components))
             for start in range(0, blocks, _IN_CACHE):
                 at = slice(start, start + _IN_CACHE)
                 W = self.errors.matrix[at]
-                taken = (flatten_blocks(W @ columns.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
-                against = W - taken @ taken.transpose(0, 2, 1)
+                root = (flatten_blocks(W @ columns.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
+                against = W - root @ root.transpose(0, 2, 1)
                 slopes += mixed.components[:, at].reshape(len(slopes), -1) @ against.ravel()
         slopes = np.exp(self.log_variances) * slopes + self.prior_slope
         count, square = mixed.noise_only
@@ -376,10 +380,11 @@ class Likelihood:
         assert isinstance(self.errors, InverseCovariance)
         X, W = self.problem.columns.Xz[0, :, :-1], self.errors.matrix[0]
         z = self.problem.mixed.z[0]
-        pushed = self.problem.mixed.components[:, 0] @ (W @ (z - X @ self.mean))
-        weighted = pushed @ W
-        explained = weighted @ X @ self.half
-        return pushed @ weighted.T - explained @ explained.T
+        # C_iPz, a row for each component: Pz is W times the residual.
+        CPz = self.problem.mixed.components[:, 0] @ (W @ (z - X @ self.mean))
+        WCPz = CPz @ W
+        explained = WCPz @ X @ self.half
+        return CPz @ WCPz.T - explained @ explained.T
 
 
 def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
@@ -410,20 +415,20 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
             at = slice(start, start + _IN_CACHE)
             white = flatten_blocks(errors.half[at] @ columns.Xz[at])
             sums += white.T @ white
-    half, of_information = _root_of_inverse(sums[:k, :k] + np.diag(problem.precision))
+    half, logdet_M = _root_of_inverse(sums[:k, :k] + np.diag(problem.precision))
     mean = half @ (half.T @ sums[:k, k])
     # Residuals z − Xβ are formed before they are squared where they can be: from `sums` alone digits cancel.
-    of_rest = np.append(-mean, 1.0)
+    to_residual = np.append(-mean, 1.0)
     if isinstance(errors, PairWeights):
-        square = float(of_rest @ sums @ of_rest)
+        square = float(to_residual @ sums @ to_residual)
     else:
-        rest = (flatten_blocks(columns.Xz) @ of_rest).reshape(*mixed.z.shape, 1)
-        square = float(np.sum((errors.half @ rest) ** 2))
+        residual = (flatten_blocks(columns.Xz) @ to_residual).reshape(*mixed.z.shape, 1)
+        square = float(np.sum((errors.half @ residual) ** 2))
     square += float(mean @ (problem.precision * mean))
     prior, prior_slope = log_prior(log_variances, mixed.further)
     count, square_of_noise = mixed.noise_only
     of_variances = errors.logdet + prior + count * log_variances[NOISE] + square_of_noise / variances[NOISE]
-    value = of_variances + of_information + problem.offset + square
+    value = of_variances + logdet_M + problem.offset + square
     return Likelihood(problem, log_variances, value, mean, half, errors, sums, of_variances, prior_slope)
 
 
@@ -446,13 +451,13 @@ def _root_of_inverse(M: Array) -> tuple[Array, float]:
 
 
 def deviance(log_variances: Array, problem: RemlProblem) -> tuple[float, Array]:
-    """Return −2 log restricted likelihood and its slope in the log variances."""
-    here = likelihood(log_variances, problem)
-    return here.deviance, here.slope
+    """Return −2 log restricted likelihood (times the prior) at log variances (c,), and its slope (c,) in these."""
+    at_variances = likelihood(log_variances, problem)
+    return at_variances.deviance, at_variances.slope
 
 
 def flatten_blocks(X: Array) -> Array:
-    """Return (B·m, a) from (B, m, a), where a may be 0, of which `reshape(-1, 0)` would not know the rows."""
+    """Return (B, m, a) as (B·m, a); `reshape(-1, a)` does not know the rows where a is 0."""
     return X.reshape(X.shape[0] * X.shape[1], X.shape[2])
 
 
@@ -474,11 +479,11 @@ class VarianceFit:
             prior: (g,) standard deviations of the last g coefficients; the others are free.
         """
         precision = np.append(np.zeros(len(self.mean) - len(prior)), prior**-2.0)
-        half, of_information = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
+        half, logdet_M = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
         mean = half @ (half.T @ self.sums[:-1, -1])
-        of_rest = np.append(-mean, 1.0)
-        square = float(of_rest @ self.sums @ of_rest + mean @ (precision * mean))
-        value = self.of_variances + of_information + 2 * float(np.log(prior).sum()) + square
+        to_residual = np.append(-mean, 1.0)
+        square = float(to_residual @ self.sums @ to_residual + mean @ (precision * mean))
+        value = self.of_variances + logdet_M + 2 * float(np.log(prior).sum()) + square
         return replace(self, deviance=value, mean=mean, covariance=half @ half.T)
 
 
@@ -503,28 +508,28 @@ def fit_variances(
     problem = reml_problem(mixed, G, prior)
     usual = usual_variances(mixed.z, mixed.components)
     first = np.log(np.maximum(usual if start is None else start, _ABSENT))
-    scattered = np.arange(len(first)) != NOISE
+    is_noise = np.arange(len(first)) == NOISE
     is_large = len(mixed.z) == 1 and mixed.z.size > _LARGE_BLOCK and mixed.further is None
-    starts = [first, first - 9.0 * scattered] if both_starts and not is_large else [first]
-    few = _FLAT if start is None or mixed.further is None else _FLAT_NEAR_MAXIMUM
-    flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else few
+    starts = [first, first - _NEARLY_ABSENT * ~is_noise] if both_starts and not is_large else [first]
+    flat = _FLAT if start is None or mixed.further is None else _FLAT_NEAR_MAXIMUM
+    flat = _FLAT_AMONG_MANY if mixed.size > MANY_NUMBERS else flat
     bounds = [
-        (centre - _SPAN[0], centre + _SPAN[1]) if scatters else _FACTORS
-        for centre, scatters in zip(np.log(usual), scattered, strict=True)
+        _FACTORS if noise else (centre - _SPAN[0], centre + _SPAN[1])
+        for centre, noise in zip(np.log(usual), is_noise, strict=True)
     ]
     present = np.einsum("cbii->c", mixed.components) > 0
-    bounds = [span if there else (np.log(_ABSENT),) * 2 for span, there in zip(bounds, present, strict=True)]
+    bounds = [span if is_there else (np.log(_ABSENT),) * 2 for span, is_there in zip(bounds, present, strict=True)]
     options = {"ftol": 1e-9, "gtol": flat, "maxiter": 60}
     search = partial(minimize, deviance, args=(problem,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     fits = []
     for begin in starts:
         # Scoring has no bounds: begun within them, it would go once more where an earlier fit has ended beyond.
-        near = fisher_scoring(problem, begin, flat) if present.all() else None
-        if near is None:
+        maximum = fisher_scoring(problem, begin, flat) if present.all() else None
+        if maximum is None:
             log_variances = search(np.clip(begin, *np.array(bounds).T)).x
             fits.append(_fit_at(problem, np.where(present, np.exp(log_variances), 0.0)))
         else:
-            fits.append(_as_variance_fit(np.exp(near.log_variances), near))
+            fits.append(_as_variance_fit(np.exp(maximum.log_variances), maximum))
     return min(fits, key=lambda fit: fit.deviance)
 
 
@@ -541,10 +546,12 @@ def at_variances(
 
 
 def _fit_at(problem: RemlProblem, variances: Array) -> VarianceFit:
+    """Return the fit of a problem at given variances (c,), which may be zero."""
     return _as_variance_fit(variances, likelihood(np.log(np.maximum(variances, _ABSENT)), problem))
 
 
 def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
+    """Return what is kept of a likelihood, as the fit at `variances` (c,)."""
     mean, covariance = solution.mean, solution.covariance
     return VarianceFit(variances, solution.deviance, mean, covariance, solution.sums, solution.of_variances)
 
@@ -563,27 +570,27 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihoo
     mixed = problem.mixed
     if 1 < len(mixed.z) < MANY_BLOCKS:
         return None
-    worthless = _CONVERGED_AMONG_MANY if mixed.size > MANY_NUMBERS else _CONVERGED
-    here = likelihood(start, problem)
+    negligible_gain = _CONVERGED_AMONG_MANY if mixed.size > MANY_NUMBERS else _CONVERGED
+    current = likelihood(start, problem)
     for _ in range(_SCORINGS):
-        if np.abs(here.slope).max() < flat:
-            return here
+        if np.abs(current.slope).max() < flat:
+            return current
         # By the quadratic model a step changes the deviance by half of slope · step.
-        prior_curvature = 2 * prior_information(np.exp(here.log_variances), mixed.further)
-        step = _scoring_step(here.curvature, here.slope, here.prior_slope, prior_curvature)
-        gain = -0.5 * float(here.slope @ step)
-        if gain < worthless:
-            return here
+        prior_curvature = 2 * prior_information(np.exp(current.log_variances), mixed.further)
+        step = _scoring_step(current.curvature, current.slope, current.prior_slope, prior_curvature)
+        gain = -0.5 * float(current.slope @ step)
+        if gain < negligible_gain:
+            return current
         for _ in range(_HALVINGS):
-            there = likelihood(here.log_variances + step, problem)
-            if there.deviance <= here.deviance + worthless:
+            trial = likelihood(current.log_variances + step, problem)
+            if trial.deviance <= current.deviance + negligible_gain:
                 break
             step /= 2
         else:
             return None
-        here = there
+        current = trial
         if gain < _LAST and mixed.further is None and len(mixed.z) > 1:
-            return here
+            return current
     return None
 
 
@@ -601,12 +608,12 @@ def _scoring_step(curvature: Array, slope: Array, prior_slope: Array, prior_curv
     """
     # Second derivatives in the variance, times its square, are those in the logarithm less the slope there. Of the
     # prior's the larger of both counts, so that the step goes downhill.
-    whole = curvature + np.diag(np.maximum(prior_curvature - prior_slope, prior_curvature))
-    share = -np.linalg.solve(whole, slope)
-    if (share > np.where(np.diag(whole) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
-        return np.maximum(np.log1p(share), -_LEAP)
-    weak = np.maximum(slope - prior_slope, 0)
-    step = -np.linalg.solve(curvature + np.diag(prior_curvature + weak), slope).astype(float)
+    with_prior = curvature + np.diag(np.maximum(prior_curvature - prior_slope, prior_curvature))
+    relative_change = -np.linalg.solve(with_prior, slope)
+    if (relative_change > np.where(np.diag(with_prior) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
+        return np.maximum(np.log1p(relative_change), -_LEAP)
+    likelihood_slope = np.maximum(slope - prior_slope, 0)
+    step = -np.linalg.solve(curvature + np.diag(prior_curvature + likelihood_slope), slope).astype(float)
     return step * min(1.0, _LEAP / float(np.abs(step).max()))
 
 

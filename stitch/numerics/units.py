@@ -27,7 +27,7 @@ def length_text(value: float, length_unit: str, digits: int = 3, zeros: bool = F
 
 
 def angle_text(value: float, digits: int = 3) -> str:
-    """An angle in rad for people: 0.033 mrad; a dash where nothing was measured."""
+    """Return an angle in rad as text in mrad: 0.033 mrad; a dash where it is not finite."""
     return f"{_plain_decimal(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
 
 
@@ -48,7 +48,7 @@ def covariate_text(name: str) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Seconds, minutes or hours, whichever leaves a number below a hundred or so."""
+    """Return seconds as text in s, min or h, whichever leaves a number below about a hundred."""
     size, unit = next((scale for scale in ((1, "s"), (60, "min")) if seconds < 120 * scale[0]), (3600, "h"))
     return f"{_plain_decimal(seconds / size, 2)} {unit}"
 
@@ -62,7 +62,7 @@ def value_uncertainty_text(value: float, U: float) -> str:
 
 
 def uncertainty_text(U: float) -> str:
-    """An expanded uncertainty above zero with the two digits that it is worth: 0.087."""
+    """Return an expanded uncertainty above zero as text with two digits: 0.087."""
     return _plain_decimal(U, 2, zeros=True)
 
 
@@ -131,6 +131,6 @@ def format_amount(value: float, sigma: float | None, unit: str) -> Amount:
 
 
 def _significant_digits(value: float, digits: int) -> str:
-    """So many digits; an exponent for the very small alone."""
+    """Return a number with so many significant digits, in a form with an exponent where it is very small."""
     text = f"{value:.{digits}g}"
     return _plain_decimal(float(text), digits) if abs(value) >= 1 else text

@@ -37,12 +37,12 @@ from stitch.numerics.reml import (
     whitener,
 )
 
-# More is as good as knowing it.
+# The largest number of degrees of freedom that is told: a variance is then as good as known.
 _MANY = 1e4
-# Rounds over all variances that count, and those before them.
-_ROUNDS, _BURNT = 32, 6
-# Among so many numbers the variances are known better, and a round takes longer: fewer do. Among as many as the second
-# number the maximum alone must do.
+# Rounds over all variances that count, and those before them that do not.
+_ROUNDS, _BURN_IN = 32, 6
+# From so many observations on a round takes longer and the variances are known better, so that fewer rounds do, but
+# these at least; from the third number on the maximum alone must do.
 _AMONG, _FEWEST, _NO_ROUNDS = 300, 4, 1_200
 # The grid in log variances: below and above a variance that is usual, and its steps as a share of how
 # well n numbers know a log variance, √(2/n), at most so long.
@@ -98,9 +98,9 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     Args:
         null: the fit without the columns whose degrees of freedom will be computed.
     """
-    half = whitener(mixed, null.variances)
-    white = null.variances[:, None, None, None] * (half @ mixed.components @ half.transpose(0, 2, 1))
-    mean = half @ mixed.A
+    inverse_root = whitener(mixed, null.variances)
+    white = null.variances[:, None, None, None] * (inverse_root @ mixed.components @ inverse_root.transpose(0, 2, 1))
+    mean = inverse_root @ mixed.A
     U = column_space(mean.reshape(-1, mean.shape[2])).reshape(*mean.shape[:2], -1)
     KU = white @ U
     within = np.einsum("bik,cbil->ckl", U, KU, optimize=True)
@@ -142,43 +142,44 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     data, rng = _remove_mean(mixed), np.random.default_rng(0)
     if not len(data.z):
         return fit.variances
-    shared = np.zeros(len(mixed.components), bool)
+    shares_factor = np.zeros(len(mixed.components), bool)
     if mixed.further is not None:
-        shared[NOISE + 1 :] = mixed.further.common_factor
+        shares_factor[NOISE + 1 :] = mixed.further.common_factor
     grids = _grids(mixed, fit.variances)
-    densities = _densities(mixed, grids, shared)
-    kin = [i for i in np.flatnonzero(shared) if data.roots[i].shape[1]]
-    here = np.array(fit.variances)
-    total, at, factor = np.zeros(len(grids)), np.zeros(len(grids), int), _USUAL
+    densities = _densities(mixed, grids, shares_factor)
+    with_factor = [i for i in np.flatnonzero(shares_factor) if data.roots[i].shape[1]]
+    # The state of the chain: the variances, their places on the grids, and the factor, a number of `_FACTORS`.
+    current, place, factor = np.array(fit.variances), np.zeros(len(grids), int), _USUAL
+    sums_of_means = np.zeros(len(grids))
     rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
-    burnt = -(-_BURNT * rounds // _ROUNDS)
-    for turn in range(burnt + rounds):
+    burn_in = -(-_BURN_IN * rounds // _ROUNDS)
+    for number in range(burn_in + rounds):
         for i, grid in enumerate(grids):
             if data.roots[i].shape[1]:
-                weights = _grid_weights(data, here, i, grid, densities[i][factor if i in kin else 0])
-                at[i] = rng.choice(len(grid), p=weights)
-                here[i] = grid[at[i]]
-                total[i] += (turn >= burnt) * float(weights @ grid)
-        if kin:
-            # Drawn where the components stand.
-            logs = _LOG_FACTOR_DENSITY + np.sum([densities[i][:, at[i]] for i in kin], axis=0)
+                weights = _grid_weights(data, current, i, grid, densities[i][factor if i in with_factor else 0])
+                place[i] = rng.choice(len(grid), p=weights)
+                current[i] = grid[place[i]]
+                if number >= burn_in:
+                    sums_of_means[i] += float(weights @ grid)
+        if with_factor:
+            logs = _LOG_FACTOR_DENSITY + np.sum([densities[i][:, place[i]] for i in with_factor], axis=0)
             weights = np.exp(logs - logs.max())
             factor = int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
-    return total / rounds
+    return sums_of_means / rounds
 
 
-def _densities(mixed: MixedModel, grids: Sequence[Array], shared: Mask) -> list[Array]:
+def _densities(mixed: MixedModel, grids: Sequence[Array], shares_factor: Mask) -> list[Array]:
     """Return the log prior density of each variance on its grid: (1, g), or (F, g) for all F factors of `_FACTORS`.
 
     Args:
         grids: per component, variances (g,).
-        shared: (c,) components that share a factor on their usual sizes.
+        shares_factor: (c,) components that share the factor on their usual sizes.
     """
-    out = []
-    for i, (grid, has_factor) in enumerate(zip(grids, shared, strict=True)):
+    densities = []
+    for i, (grid, has_factor) in enumerate(zip(grids, shares_factor, strict=True)):
         priors = [mixed.further.scaled(f) for f in _FACTORS] if has_factor and mixed.further else [mixed.further]
-        out.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
-    return out
+        densities.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
+    return densities
 
 
 def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
@@ -234,17 +235,17 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
         LinAlgError: the covariance is not positive.
     """
     covariance = data.fixed + np.tensordot(current, data.components, axes=1)
-    # What surrounds these routines in scipy takes longer than they do.
-    half, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
+    # LAPACK directly: what scipy does around these routines takes longer than they do.
+    L, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("covariance is not positive")
-    white = dtrtrs(half, np.column_stack([data.roots[i], data.z]), lower=1)[0]
-    root, z = white[:, :-1], white[:, -1]
-    values, vectors = np.linalg.eigh(root.T @ root)
-    values = np.maximum(values, 1e-300)
-    along = vectors.T @ (root.T @ z)
-    # By rounding the covariance could lose its last positive part.
-    times = np.maximum(1 + (grid[:, None] - current[i]) * values, 1e-12)
-    logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)
+    white = dtrtrs(L, np.column_stack([data.roots[i], data.z]), lower=1)[0]
+    R, z = white[:, :-1], white[:, -1]
+    m, v = np.linalg.eigh(R.T @ R)
+    m = np.maximum(m, 1e-300)
+    a = v.T @ (R.T @ z)
+    # Bounded, since by rounding the covariance could lose its last positive part.
+    t = np.maximum(1 + (grid[:, None] - current[i]) * m, 1e-12)
+    logs = density - 0.5 * (np.log(t) + a**2 / m * (1 / t - 1)).sum(axis=1)
     weights = np.exp(logs - logs.max())
     return weights / weights.sum()

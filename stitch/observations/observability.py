@@ -21,9 +21,11 @@ from stitch.session.scan import centroid, spread
 
 # Names of the hand-eye's numbers: position, then rotation vector.
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
+# A direction of the hand-eye of a smaller gain (`motion_gain`, a pure number) is not shown by the motions.
 _VISIBLE = 0.01
 # Step of a derivative, as a share of what moves the part by its unit.
 _SMALL = 1e-4
+# Directions within 2° are parallel.
 _PARALLEL = np.cos(np.radians(2.0))
 # Joints that turn by less stand still.
 _TURNED = np.radians(0.5)
@@ -58,25 +60,26 @@ def motion_gain(
     """
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
-    several = 1 + max((int(c.scanner.max()) for c in captures if c.scanner is not None), default=0)
-    total, views = np.zeros((6 * several, 6 * several)), 0
+    scanners = 1 + max((int(c.scanner.max()) for c in captures if c.scanner is not None), default=0)
+    # Σ JᵀJ over the views, with J the motion of a view per twist of each scanner's hand-eye, less its mean.
+    squares, views = np.zeros((6 * scanners, 6 * scanners)), 0
     for capture in captures:
         poses = capture.poses(T_mount) @ about
         to_part = frames.make(np.eye(3), -poses[:, :3, 3].mean(axis=0))
-        response = np.linalg.inv(scale) @ frames.adjoint(to_part @ poses) @ scale
+        J = np.linalg.inv(scale) @ frames.adjoint(to_part @ poses) @ scale
         if capture.scanner is not None:
-            own = np.eye(several)[capture.scanner]
-            response = np.einsum("vij,vs->visj", response, own).reshape(len(poses), 6, -1)
-        response = response - response.mean(axis=0)
-        total += np.einsum("vij,vik->jk", response, response)
+            is_own = np.eye(scanners)[capture.scanner]
+            J = np.einsum("vij,vs->visj", J, is_own).reshape(len(poses), 6, -1)
+        J = J - J.mean(axis=0)
+        squares += np.einsum("vij,vik->jk", J, J)
         views += len(poses)
-    if several > 1:
+    if scanners > 1:
         # The Schur complement lets the other scanners go where they fit best.
-        at = np.arange(6 * scanner, 6 * scanner + 6)
-        rest = np.setdiff1d(np.arange(len(total)), at)
-        taken = total[np.ix_(at, rest)] @ np.linalg.pinv(total[np.ix_(rest, rest)], rcond=1e-9, hermitian=True)
-        total = total[np.ix_(at, at)] - taken @ total[np.ix_(rest, at)]
-    values, vectors = np.linalg.eigh(total / views)
+        own = np.arange(6 * scanner, 6 * scanner + 6)
+        rest = np.setdiff1d(np.arange(len(squares)), own)
+        across = squares[np.ix_(own, rest)] @ np.linalg.pinv(squares[np.ix_(rest, rest)], rcond=1e-9, hermitian=True)
+        squares = squares[np.ix_(own, own)] - across @ squares[np.ix_(rest, own)]
+    values, vectors = np.linalg.eigh(squares / views)
     return np.sqrt(np.maximum(values, 0)), scale @ vectors
 
 

@@ -1,5 +1,6 @@
 """Where each of several scanners in one cell stands under their common model, beside what its own views alone say."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,16 +45,16 @@ class ScannerPlace(Value):
     name: str
     T_mount: Array  # (4, 4) T_base_scanner or T_flange_scanner
     covariance: Array  # (6, 6) of T·exp(ξ), rotation first
-    U: float  # at what it saw
+    U: float  # expanded uncertainty (k = 2) of the middle of what it saw
     alone: ScannerAlone | None = None
-    U_alone: float = float("nan")
-    apart: float = float("nan")  # what its own views alone would move what it saw by
-    unobservable: tuple[str, ...] = ()
-    unknown: tuple[str, ...] = field(default=())
+    U_alone: float = float("nan")  # the same by its own views alone
+    apart: float = float("nan")  # distance between where its own views alone and all views put that middle
+    unobservable: tuple[str, ...] = ()  # directions of its hand-eye that the motions do not show, in words
+    unknown: tuple[str, ...] = field(default=())  # those of x, y, z, rx, ry, rz that they do not determine
 
     @property
     def sigma(self) -> Array:
-        """(6,) standard deviations."""
+        """(6,) standard deviations of T·exp(ξ), rad before length_unit."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -78,43 +79,61 @@ def scanner_places(
     term = next((term for term in model.terms if term.name == SCANNER_PLACEMENT), None)
     if not scanners or term is None:
         return ()
-    known = model.effects_covariance
-    rows = [f"{term.name}.{p.name}" for p in term.parameters]
     K = len(scanners.names) - 1
     # The parameters are ordered rotation vectors of all scanners, then translations; here they go scanner by scanner.
     order = np.arange(6 * K).reshape(2, K, 3).transpose(1, 0, 2).reshape(K, 6)
-    moved = np.vstack([np.zeros(6), term.values[order]])
-    known_by_name = {name: i for i, name in enumerate(known.names)}
-    by_own_views = {own.scanner: own for own in alone}
+    twists = np.vstack([np.zeros(6), term.values[order]])
+    alone_by_name = {own.scanner: own for own in alone}
     places = []
     for k, name in enumerate(scanners.names):
-        T_first = scanners.T_first[k] @ frames.exp(moved[k])
-        T_mount = model.T_mount @ T_first
-        J = np.hstack([frames.adjoint(frames.inverse(T_first)), np.eye(6)])
-        joint = np.zeros((12, 12))
-        joint[:6, :6] = model.covariance
-        at = [] if k == 0 else [known_by_name.get(rows[i], -1) for i in order[k - 1]]
-        for a, i in ((a, i) for a, i in enumerate(at) if i >= 0):
-            joint[:6, 6 + a] = joint[6 + a, :6] = known.with_hand_eye[:, 6 + i] if known.with_hand_eye.size else 0.0
-            joint[6 + a, 6:] = [known.matrix[i, j] if j >= 0 else 0.0 for j in at]
-        covariance = J @ joint @ J.T
+        T_first_scanner = scanners.T_first[k] @ frames.exp(twists[k])
+        T_mount = model.T_mount @ T_first_scanner
+        # A twist of the first scanner's hand-eye, seen in this scanner's frame, and one of its place from the first.
+        J = np.hstack([frames.adjoint(frames.inverse(T_first_scanner)), np.eye(6)])
+        parameters = [] if k == 0 else [f"{term.name}.{term.parameters[i].name}" for i in order[k - 1]]
+        covariance = J @ _covariance_with_hand_eye(model, parameters) @ J.T
         middle = seen_part([capture], k)[0]
-        own = by_own_views.get(name)
-        off = np.zeros(3) if own is None else frames.transform(own.hand_eye, middle) - frames.transform(T_mount, middle)
+        own = alone_by_name.get(name)
+        U_alone = apart = float("nan")
+        if own is not None:
+            U_alone = displacement(own.covariance, middle)
+            offset = frames.transform(own.hand_eye, middle) - frames.transform(T_mount, middle)
+            apart = float(np.linalg.norm(offset))
         places.append(
             ScannerPlace(
-                name,
-                T_mount,
-                covariance,
-                displacement(covariance, middle),
-                own,
-                float("nan") if own is None else displacement(own.covariance, middle),
-                float("nan") if own is None else float(np.linalg.norm(off)),
-                unobservable([capture], model.T_mount, measurement.robot, scanner=k),
-                unknown_numbers([capture], model.T_mount, k),
+                name=name,
+                T_mount=T_mount,
+                covariance=covariance,
+                U=displacement(covariance, middle),
+                alone=own,
+                U_alone=U_alone,
+                apart=apart,
+                unobservable=unobservable([capture], model.T_mount, measurement.robot, scanner=k),
+                unknown=unknown_numbers([capture], model.T_mount, k),
             )
         )
     return tuple(places)
+
+
+def _covariance_with_hand_eye(model: Model, parameters: Sequence[str]) -> Array:
+    """Return the covariance (12, 12) of the hand-eye's twist (6) and of the six parameters that place a scanner.
+
+    Rows of parameters that were not fitted are zero.
+
+    Args:
+        parameters: their names, effect.parameter; none for the first scanner, whose place is the hand-eye.
+    """
+    known = model.effects_covariance
+    covariance = np.zeros((12, 12))
+    covariance[:6, :6] = model.covariance
+    index = {name: i for i, name in enumerate(known.names)}
+    fitted = [(6 + row, index[name]) for row, name in enumerate(parameters) if name in index]
+    for row, i in fitted:
+        if known.with_hand_eye.size:
+            covariance[:6, row] = covariance[row, :6] = known.with_hand_eye[:, 6 + i]
+        for column, j in fitted:
+            covariance[row, column] = known.matrix[i, j]
+    return covariance
 
 
 def contradictions(places: tuple[ScannerPlace, ...], length_unit: str) -> tuple[str, ...]:
