@@ -22,15 +22,15 @@ from stitch.session.capture import Capture, build_capture, part_size, with_scann
 from stitch.session.measurement import Measurement, measurement_of
 from stitch.session.session import SessionData
 
-# Random turns that are tried, those that are improved, and how far a right one may be off, rad.
+# Random sets of rotations that are tried, those that are improved, and the angle, rad, at which one motion's is capped.
 _DRAWS, _IMPROVED, _OFF = 20_000, 24, 0.3
 # A motion is explained within so many rad and so much of the part's size.
 _ANGLE, _SHARE = 0.03, 0.03
 # Fewer explained motions place no axis; of so many unknowns a third of what they say.
 _FEWEST = 5
 _BLOCK = 500
-# Views that are turned most alike, of each.
-_ALIKE = 3
+# Partners of a view by their orientation; weighted solutions for places.
+_ALIKE, _REWEIGHTED = 3, 20
 
 
 def locate_axes(
@@ -68,14 +68,14 @@ def _placed(session: SessionData, measurement: Measurement) -> Measurement:
 
 @dataclass(frozen=True)
 class _Motions:
-    """What is known before: readings, reported poses, and motions of the scans between pairs of views."""
+    """What the search begins with: readings, reported poses, and motions of the scanner between pairs of views."""
 
-    axes: Axes
+    axes: Axes  # K axes with their readings
     reported: Array  # (V, 4, 4) T_base_flange
-    to_hand: bool
-    pairs: Array  # (P, 2)
-    scanner: Array  # (P, 4, 4) from the second view's scanner frame into the first's
-    size: float  # of the part
+    to_hand: bool  # the part is in the hand, the scanner stands in the cell
+    pairs: Array  # (P, 2) views
+    scanner: Array  # (P, 4, 4) registered motions, from the second view's scanner frame into the first's
+    size: float  # of the part, length_unit
 
     def turned(self, directions: Array) -> Array:
         """Return rotations (N, V, 3, 3) of T_reference_mount for N guesses at the directions (N, K, 3) of K axes.
@@ -112,8 +112,9 @@ class _Motions:
     def places(self, directions: Array, R_mount: Array, use: Array) -> tuple[tuple[Axis, ...], Array] | None:
         """Return axes and hand-eye (4, 4) for given rotations: what is unknown of positions is linear least squares.
 
-        The unknowns x are the translation of the hand-eye (3), and per axis a point (3, rotary) and a travel per unit
-        of the reading (3, linear). Weights make wrong motions count little, repeated 20 times.
+        The unknowns x (3 + 6K,) are the translation of the hand-eye (3), then per axis a point (3) of a rotary one and
+        the travel per unit of the reading (3) of a linear one. Those of stated axes are not fitted. Weights make wrong
+        motions count little, repeated `_REWEIGHTED` times.
 
         Args:
             directions: (K, 3) of the rotary axes.
@@ -123,53 +124,47 @@ class _Motions:
         Returns:
             None where a linear axis has no direction.
         """
-        K = len(self.axes.axes)
-        size = 3 + 6 * K
 
-        def shifts(x: Array) -> Array:
+        def residuals(x: Array) -> Array:
             """Return residuals (3P,) of the translations between views, first view's scanner frame, for unknowns x."""
-            placed = self._shifted(directions, x)
-            pose = placed @ frames.make(R_mount, x[:3])
+            pose = self._mount_poses(directions, x) @ frames.make(R_mount, x[:3])
             first, second = pose[self.pairs[use, 0]], pose[self.pairs[use, 1]]
-            off = second[:, :3, 3] - first[:, :3, 3]
-            inside = np.einsum("pji,pj->pi", first[:, :3, :3], off)
-            return np.asarray((inside - self.scanner[use, :3, 3]).ravel())
+            translation = np.einsum("pji,pj->pi", first[:, :3, :3], second[:, :3, 3] - first[:, :3, 3])
+            return np.asarray((translation - self.scanner[use, :3, 3]).ravel())
 
-        at = np.zeros(size)
-        for k, axis in enumerate(self.axes.axes):
-            if axis.is_placed and axis.point is not None:
-                at[3 + 6 * k : 6 + 6 * k] = axis.point
-            if axis.is_placed and not axis.is_rotary:
-                at[6 + 6 * k : 9 + 6 * k] = axis.direction
+        x = np.zeros(3 + 6 * len(self.axes.axes))
         free = [0, 1, 2]
         for k, axis in enumerate(self.axes.axes):
+            point, travel = 3 + 6 * k + np.arange(3), 6 + 6 * k + np.arange(3)
             if not axis.is_placed:
-                start = 3 + 6 * k if axis.is_rotary else 6 + 6 * k
-                free += [start, start + 1, start + 2]
-        # `shifts` is linear in x: differences are its columns.
-        base = shifts(at)
-        columns = np.column_stack([shifts(at + np.eye(size)[i]) - base for i in free])
-        x = at.copy()
-        weight = np.ones(len(base))
-        for _ in range(20):
-            step = np.linalg.lstsq(columns * weight[:, None], -base * weight, rcond=1e-4)[0]
-            left = np.linalg.norm((base + columns @ step).reshape(-1, 3), axis=1)
-            weight = np.repeat(1 / np.sqrt(1 + (left / (_SHARE * self.size)) ** 2) ** 2, 3)
+                free.extend(point if axis.is_rotary else travel)
+            elif not axis.is_rotary:
+                x[travel] = axis.direction
+            if axis.is_placed and axis.point is not None:
+                x[point] = axis.point
+        # They are linear in x: differences are the columns.
+        at_stated = residuals(x)
+        columns = np.column_stack([residuals(x + np.eye(len(x))[i]) - at_stated for i in free])
+        weight = np.ones(len(at_stated))
+        for _ in range(_REWEIGHTED):
+            step = np.linalg.lstsq(columns * weight[:, None], -at_stated * weight, rcond=1e-4)[0]
+            distances = np.linalg.norm((at_stated + columns @ step).reshape(-1, 3), axis=1)
+            weight = np.repeat(1 / np.sqrt(1 + (distances / (_SHARE * self.size)) ** 2) ** 2, 3)
         x[free] += step
         axes = []
         for k, axis in enumerate(self.axes.axes):
-            way = x[6 + 6 * k : 9 + 6 * k]
+            travel = x[6 + 6 * k : 9 + 6 * k]
             if axis.is_placed:
                 axes.append(axis)
             elif axis.is_rotary:
                 axes.append(replace(axis, direction=directions[k], point=x[3 + 6 * k : 6 + 6 * k]))
-            elif np.linalg.norm(way) > 0:
-                axes.append(replace(axis, direction=way / np.linalg.norm(way)))
+            elif np.linalg.norm(travel) > 0:
+                axes.append(replace(axis, direction=travel / np.linalg.norm(travel)))
             else:
                 return None
         return tuple(axes), frames.make(R_mount, x[:3])
 
-    def _shifted(self, directions: Array, x: Array) -> Array:
+    def _mount_poses(self, directions: Array, x: Array) -> Array:
         """Return T_reference_mount (V, 4, 4) for K axes: A_left⁻¹ · A_right · T_base_flange, or its inverse.
 
         Each axis is a factor A of A_left or A_right (`Axes.stands_right`). The inverse is for a part in hand.
@@ -183,12 +178,12 @@ class _Motions:
         left = right = np.broadcast_to(np.eye(4), (count, 4, 4))
         for k, axis in enumerate(self.axes.axes):
             reading = self.axes.readings[:, k, None]
-            point, way = x[3 + 6 * k : 6 + 6 * k], x[6 + 6 * k : 9 + 6 * k]
+            point, travel = x[3 + 6 * k : 6 + 6 * k], x[6 + 6 * k : 9 + 6 * k]
             if axis.is_rotary:
                 R = Rotation.from_rotvec(directions[k] * reading).as_matrix()
                 A = frames.make(R, point - R @ point)
             else:
-                A = frames.make(np.broadcast_to(np.eye(3), (count, 3, 3)), way * reading)
+                A = frames.make(np.broadcast_to(np.eye(3), (count, 3, 3)), travel * reading)
             if self.axes.stands_right(axis):
                 right = right @ A
             else:
@@ -208,8 +203,8 @@ class _Motions:
         motion = AxisMotion(axes.readings, placement, np.zeros((len(axes.axes), 3)), axes.as_read().error)
         T = axes.carried(motion) @ self.reported
         pose = (frames.inverse(T) if self.to_hand else T) @ T_mount
-        foretold = frames.inverse(pose[self.pairs[:, 0]]) @ pose[self.pairs[:, 1]]
-        return frames.log(frames.inverse(self.scanner) @ foretold) * np.repeat([self.size, 1.0], 3)
+        predicted = frames.inverse(pose[self.pairs[:, 0]]) @ pose[self.pairs[:, 1]]
+        return frames.log(frames.inverse(self.scanner) @ predicted) * np.repeat([self.size, 1.0], 3)
 
 
 def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
@@ -229,19 +224,21 @@ def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
         register_pairs(capture, pairs),
         part_size([capture]),
     )
-    best: tuple[int, float, Axes, Array] | None = None
-    for directions, R_mount in _turns(motions, session.scanner.T_mount):
+    best: tuple[Axis, ...] | None = None
+    # Motions that agree, and their summed distances, negative: more and nearer is better.
+    best_score = (_FEWEST, -np.inf)
+    for directions, R_mount in _likely_rotations(motions, session.scanner.T_mount):
         use = motions.angles(directions[None], R_mount[None])[0] < 3 * _ANGLE
         placed = motions.places(directions, R_mount, use) if use.sum() >= _FEWEST else None
         if placed is None:
             continue
         refined, T_mount = _refined(motions, replace(axes, axes=placed[0]), placed[1])
-        off = np.linalg.norm(motions.residual(refined, np.zeros((len(axes.axes), 6)), T_mount), axis=1)
-        near = off < _SHARE * motions.size
-        trial = (int(near.sum()), -float(off[near].sum()), refined, T_mount)
-        if best is None or trial[:2] > best[:2]:
-            best = trial
-    return None if best is None or best[0] < _FEWEST else best[2].axes
+        distances = np.linalg.norm(motions.residual(refined, np.zeros((len(axes.axes), 6)), T_mount), axis=1)
+        agrees = distances < _SHARE * motions.size
+        score = (int(agrees.sum()), -float(distances[agrees].sum()))
+        if score > best_score:
+            best, best_score = refined.axes, score
+    return best
 
 
 def _pairs(axes: Axes, reported: Array) -> list[tuple[int, int]]:
@@ -265,7 +262,7 @@ def _pairs(axes: Axes, reported: Array) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _turns(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]]:
+def _likely_rotations(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]]:
     """Return up to four distinct pairs of axis directions (K, 3) and hand-eye rotation (3, 3), likeliest first.
 
     Random guesses are scored by capped angles between motions as registered and as predicted; the best `_IMPROVED`
@@ -275,12 +272,12 @@ def _turns(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]
         T_mount: (4, 4) hand-eye whose rotation is then fixed; None: it is searched too.
     """
     rng = np.random.default_rng(0)
-    known = [axis.direction for axis in motions.axes.axes]
-    wanted = [k for k, axis in enumerate(motions.axes.axes) if axis.is_rotary and known[k] is None]
+    stated = [axis.direction for axis in motions.axes.axes]
+    wanted = [k for k, axis in enumerate(motions.axes.axes) if axis.is_rotary and stated[k] is None]
     draws = _DRAWS if T_mount is None or len(wanted) > 1 else _DRAWS // 10
-    directions = rng.standard_normal((draws, len(known), 3))
+    directions = rng.standard_normal((draws, len(stated), 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    for k, direction in enumerate(known):
+    for k, direction in enumerate(stated):
         if direction is not None:
             directions[:, k] = direction
     R_mount = np.asarray(Rotation.random(draws, rng=rng).as_matrix())
@@ -289,22 +286,17 @@ def _turns(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]
     blocks = range(0, draws, _BLOCK)
     capped = [np.minimum(motions.angles(directions[i : i + _BLOCK], R_mount[i : i + _BLOCK]), _OFF) for i in blocks]
     order = np.argsort((np.concatenate(capped) ** 2).sum(axis=1))[:_IMPROVED]
-    trials = [_improved_turn(motions, directions[i], R_mount[i], wanted) for i in order]
-    scored = [(float((np.minimum(motions.angles(d[None], R[None]), _ANGLE) ** 2).sum()), d, R) for d, R in trials]
+    trials = [_improved_rotations(motions, directions[i], R_mount[i], wanted) for i in order]
+    costs = [float((np.minimum(motions.angles(d[None], R[None]), _ANGLE) ** 2).sum()) for d, R in trials]
     distinct: list[tuple[Array, Array]] = []
-    for _, d, R in sorted(scored, key=lambda item: item[0]):
-        if all(
-            frames.angle_between(_turn(R), _turn(R2)) > _ANGLE or np.abs(d - d2).max() > _ANGLE for d2, R2 in distinct
-        ):
+    for i in np.argsort(costs, kind="stable"):
+        d, R = trials[i]
+        if all(frames.angle_between(R, R2) > _ANGLE or np.abs(d - d2).max() > _ANGLE for d2, R2 in distinct):
             distinct.append((d, R))
     return distinct[:4]
 
 
-def _turn(R: Array) -> Array:
-    return frames.make(R, np.zeros(3))
-
-
-def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:
+def _improved_rotations(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:
     """Return directions (K, 3) and R_mount (3, 3) after robust least squares of the angles between motions.
 
     Args:
@@ -321,6 +313,7 @@ def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted:
         return turned, R_mount @ Rotation.from_rotvec(x[:3]).as_matrix()
 
     def residual(x: Array) -> Array:
+        """Return the angles (P,) rad between motions as registered and as predicted after a step x."""
         d, R = moved(x)
         return motions.angles(d[None], R[None])[0]
 

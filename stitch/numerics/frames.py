@@ -219,3 +219,12 @@ def moved_about(centre: Array, twists: Array, T: Array) -> Array:
     """Return poses T_a_b (..., 4, 4) moved by twists (..., 6) in frame a that turn about its point `centre` (3,)."""
     to_centre = make(np.eye(3), -centre)
     return inverse(to_centre) @ exp(twists) @ to_centre @ T
+
+
+def twists_about(centre: Array, start: Array, end: Array) -> Array:
+    """Return twists (..., 6) in frame a, about its point `centre` (3,), that move poses T_a_b `start` to `end`.
+
+    The inverse of `moved_about`, for poses (..., 4, 4).
+    """
+    to_centre = make(np.eye(3), -centre)
+    return log(to_centre @ end @ inverse(to_centre @ start))

@@ -404,8 +404,8 @@ class LinearModel:
         (sets, views, count), k = shapes.shape, twists.shape[2]
         information = _sum_over_views(twists.transpose(0, 2, 1) @ own @ twists, shapes)
         by_shape = shapes.transpose(0, 2, 1).reshape(-1, views)
-        moved = (by_shape @ (shared @ twists).reshape(views, -1)).reshape(sets, count, -1, k)
-        moved = moved.transpose(0, 2, 3, 1).reshape(sets, -1, k * count)
+        by_motion = (by_shape @ (shared @ twists).reshape(views, -1)).reshape(sets, count, -1, k)
+        moved = by_motion.transpose(0, 2, 3, 1).reshape(sets, -1, k * count)
         pulled = (by_shape @ np.einsum("vi,vik->vk", pulls, twists)).reshape(sets, count, k)
         return information + sign * moved.transpose(0, 2, 1) @ moved, pulled.transpose(0, 2, 1).reshape(sets, -1)
 

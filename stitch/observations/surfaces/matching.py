@@ -25,11 +25,11 @@ _PROBES = 250
 MINIMUM_OVERLAP = 0.04
 # Views in which one point of another view is asked for.
 _MOST_PARTNERS = 20
-# A search goes on so much farther than the gate: what comes nearer with little motion is known already.
+# Nearest points are searched within so many gates: after little motion, what comes within the gate is known already.
 _REACH = 1.1
-# Of so large a share of the queries that may have another partner, all are asked: then it costs no more.
+# Where a larger share of the queries may have another nearest point, all are searched: that costs no more.
 _MOST_OPEN = 0.5
-# Some of a view's sampled points.
+# A view, and which of its sampled points are searched in another view.
 QueryPart = tuple[int, slice]
 
 
@@ -52,8 +52,8 @@ def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[i
     """
     placed = [frames.transform(T, box_corners(scan.box)) for scan, T in zip(scans, poses, strict=True)]
     low, high = np.min(placed, axis=1), np.max(placed, axis=1)
-    apart = (low[:, None] - high[None] > gate).any(axis=2)
-    v, w = np.nonzero(np.triu(~(apart | apart.T), 1))
+    is_above = (low[:, None] - high[None] > gate).any(axis=2)
+    v, w = np.nonzero(np.triu(~(is_above | is_above.T), 1))
     return list(zip(v.tolist(), w.tolist(), strict=True))
 
 
@@ -68,10 +68,10 @@ def overlapping_pairs(
     """
     queries = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
     near = near_pairs(scans, poses, gate)
-    one = overlap_shares(queries, near, gate)
+    shares = overlap_shares(queries, near, gate)
     # A small view inside a large one: few of the large one's points meet, but most of the small one's do.
-    other = overlap_shares(queries, [(w, v) for v, w in near if one[v, w] < MINIMUM_OVERLAP], gate)
-    return [(v, w) for v, w in near if max(one[v, w], other.get((w, v), 0.0)) >= MINIMUM_OVERLAP]
+    shares |= overlap_shares(queries, [(w, v) for v, w in near if shares[v, w] < MINIMUM_OVERLAP], gate)
+    return [(v, w) for v, w in near if max(shares[v, w], shares.get((w, v), 0.0)) >= MINIMUM_OVERLAP]
 
 
 def overlap_shares(
@@ -85,21 +85,22 @@ def overlap_shares(
         queries: points of all views that are searched.
         pairs: ordered pairs (v, w).
     """
-    # All that ask one view are searched in its tree at once; the views in parallel.
-    asking = defaultdict[int, list[int]](list)
+    # The points of all views that are searched in one view go into its tree at once; the views in parallel.
+    views_by_searched = defaultdict[int, list[int]](list)
     for v, w in pairs:
-        asking[w].append(v)
+        views_by_searched[w].append(v)
 
-    def meeting(asked: tuple[int, list[int]]) -> list[float]:
-        """Return, for `asked` = (w, views), the share of each of these views' points that find a partner in view w."""
-        w, views = asked
+    def shares_in(search: tuple[int, list[int]]) -> list[float]:
+        """Return, for (w, views), the share of each of these views' points that find a partner in view w."""
+        w, views = search
         parts = [(v, slice(None)) for v in views]
         _, points, normals = queries.gather(parts)
         accepted = np.split(queries.search(w, points, normals, gate)[1], np.cumsum(queries.counts(parts))[:-1])
         return [float(np.mean(of_view)) if len(of_view) else 0.0 for of_view in accepted]
 
-    answers = zip(asking.items(), parallel(meeting, asking.items()), strict=True)
-    return {(v, w): share for (w, views), shares in answers for v, share in zip(views, shares, strict=True)}
+    searches = views_by_searched.items()
+    found = zip(searches, parallel(shares_in, searches), strict=True)
+    return {(v, w): share for (w, views), shares in found for v, share in zip(views, shares, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class Match:
     index_w: Indices  # (M,) point of view w
 
     def subset(self, at: slice) -> "Match":
-        """Return some of them."""
+        """Return some of the correspondences."""
         return Match(self.v, self.w, *(value[at] for value in self.columns))
 
     @property
@@ -125,7 +126,7 @@ class Match:
         return list(vars(self).values())[2:]
 
     def swapped(self) -> "Match":
-        """Return the same as the other view sees it."""
+        """Return the same correspondences with the roles of the two views exchanged."""
         return replace(self, v=self.w, w=self.v, residual=-self.residual, index_v=self.index_w, index_w=self.index_v)
 
 
@@ -142,9 +143,9 @@ class Searched:
     """The partners of the points of all views, kept so that after little motion few have to be searched again."""
 
     queries: "NeighbourQueries"
-    parts: list[list[QueryPart]]  # per view those that ask it
+    parts: list[list[QueryPart]]  # per view the points that were searched in it
     gate: float  # largest distance between partners, length_unit
-    nearest: list[Nearest]  # per view asked
+    nearest: list[Nearest]  # per view, of the points that were searched in it
 
     def still_open(
         self, queries: "NeighbourQueries", parts: list[list[QueryPart]], gate: float
@@ -170,18 +171,18 @@ class Searched:
         if not (same_scans and all(map(np.array_equal, before.index, queries.index))):
             return None
         corners = np.array([box_corners(scan.box) for scan in queries.scans])
-        out, total = list[Indices](), 0
-        for w, (asking, nearest) in enumerate(zip(parts, self.nearest, strict=True)):
-            v = [view for view, _ in asking]
+        still_open, total = list[Indices](), 0
+        for w, (parts_in_w, nearest) in enumerate(zip(parts, self.nearest, strict=True)):
+            v = [view for view, _ in parts_in_w]
             # A point inside a box moves no more than one of its corners.
-            was = frames.transform(frames.inverse(before.poses[w]) @ before.poses[v], corners[v])
-            now = frames.transform(frames.inverse(queries.poses[w]) @ queries.poses[v], corners[v])
-            moved = np.linalg.norm(now - was, axis=2).max(axis=1)
+            corners_before = frames.transform(frames.inverse(before.poses[w]) @ before.poses[v], corners[v])
+            corners_now = frames.transform(frames.inverse(queries.poses[w]) @ queries.poses[v], corners[v])
+            moved = np.linalg.norm(corners_now - corners_before, axis=2).max(axis=1)
             if gate + moved.max(initial=0.0) > _REACH * self.gate:
                 return None
-            out.append(np.flatnonzero(nearest.lead < np.repeat(2 * moved, queries.counts(asking))))
+            still_open.append(np.flatnonzero(nearest.lead < np.repeat(2 * moved, queries.counts(parts_in_w))))
             total += len(nearest.lead)
-        return out if sum(map(len, out)) < _MOST_OPEN * total else None
+        return still_open if sum(map(len, still_open)) < _MOST_OPEN * total else None
 
 
 def match_pairs(
@@ -209,37 +210,38 @@ def match_pairs(
     """
     if turns is None:
         turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
+    # Per view, the points of other views that are searched in it.
     parts = [list[QueryPart]() for _ in scans]
     for v, w in pairs:
-        for asking, asked in ((v, w), (w, v)):
-            parts[asked].append((asking, slice(asked % turns[asking], None, turns[asking])))
+        for view, searched in ((v, w), (w, v)):
+            parts[searched].append((view, slice(searched % turns[view], None, turns[view])))
     queries = neighbour_queries(scans, poses, samples)
-    again = None if before is None else before.still_open(queries, parts, gate)
+    # Only the queries whose nearest point may have changed; None: all.
+    still_open = None if before is None else before.still_open(queries, parts, gate)
 
     def search_view(w: int) -> tuple[Nearest, dict[int, Match]]:
         """Return the nearest points in view w of all queries, and by querying view the matches within the gate."""
         if not parts[w]:
             return Nearest(np.zeros(0, np.int32), np.zeros(0, np.float32)), {}
         index, points, normals = queries.gather(parts[w])
-        if before is None or again is None:
+        if before is None or still_open is None:
             nearest = queries.nearest(w, points, gate)
             partner = nearest.partner
         else:
-            # Only the queries whose nearest point may have changed are searched.
             nearest = before.nearest[w]
             partner = nearest.partner.copy()
-            partner[again[w]] = queries.partners(w, points.take(again[w], axis=0), gate)
+            partner[still_open[w]] = queries.partners(w, points.take(still_open[w], axis=0), gate)
         return nearest, _partners_by_view(queries, w, parts[w], gate, partner, (index, points, normals))
 
-    nearest, answers = zip(*parallel(search_view, range(len(scans))), strict=True)
+    nearest, found = zip(*parallel(search_view, range(len(scans))), strict=True)
     matches = []
     for v, w in pairs:
-        both = [match for match in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(match.residual)]
-        if both:
-            columns = zip(*(match.columns for match in both), strict=True)
+        both_ways = [match for match in (found[w].pop(v), found[v].pop(w).swapped()) if len(match.residual)]
+        if both_ways:
+            columns = zip(*(match.columns for match in both_ways), strict=True)
             matches.append(Match(v, w, *(np.concatenate(column) for column in columns)))
     # A search of some queries is no new `before`: its leads are still those under the poses of the last full search.
-    if before is None or again is None:
+    if before is None or still_open is None:
         # Points and normals under these poses are not needed again: the next search has its own.
         lean = replace(queries, poses=np.array(poses), points=[], normals=[])
         before = Searched(lean, parts, gate, list(nearest))
@@ -252,7 +254,7 @@ def _partners_by_view(
     parts: Sequence[QueryPart],
     gate: float,
     nearest: NDArray[np.int32],
-    asking: tuple[Indices, Array, Array],
+    searched: tuple[Indices, Array, Array],
 ) -> dict[int, Match]:
     """Return by view v its matches in view w: pairs of points within the gate whose normals differ by less than 45°.
 
@@ -260,20 +262,20 @@ def _partners_by_view(
         parts: which points of which views were searched in view w.
         gate: largest distance between corresponding points, length_unit.
         nearest: (N,) number of the nearest point of view w for each query, -1 where there is none.
-        asking: number (N,), point and normal (N, 3), reference frame, of each query, in the order of `parts`.
+        searched: index (N,), point and normal (N, 3), reference frame, of each query, in the order of `parts`.
     """
     scan, T = queries.scans[w], queries.poses[w]
     some = np.flatnonzero(nearest >= 0)
-    index, partner = asking[0][some], nearest[some].astype(np.int64)
+    index, partner = searched[0][some], nearest[some].astype(np.int64)
     # Rows of three by `take`: an index in brackets takes four times as long.
-    p, n = asking[1].take(some, axis=0), asking[2].take(some, axis=0)
+    p, n = searched[1].take(some, axis=0), searched[2].take(some, axis=0)
     q = frames.transform(T, scan.points.take(partner, axis=0))
     m = frames.rotate(T, scan.normals.take(partner, axis=0))
-    apart, cosine = p - q, np.einsum("ij,ij->i", n, m)
+    difference, cosine = p - q, np.einsum("ij,ij->i", n, m)
     normal = n + m
     normal /= np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-    middle, residual = (p + q) / 2, np.einsum("ij,ij->i", apart, normal)
-    keep = np.flatnonzero((np.einsum("ij,ij->i", apart, apart) < gate**2) & (cosine > _NORMAL_COSINE))
+    middle, residual = (p + q) / 2, np.einsum("ij,ij->i", difference, normal)
+    keep = np.flatnonzero((np.einsum("ij,ij->i", difference, difference) < gate**2) & (cosine > _NORMAL_COSINE))
     bounds = np.searchsorted(some[keep], np.append(0, np.cumsum(queries.counts(parts))))
     matches = {}
     for (v, _), start, end in zip(parts, bounds[:-1], bounds[1:], strict=True):
@@ -303,7 +305,7 @@ class NeighbourQueries:
     normals: list[Array]  # per view (n, 3), reference frame
 
     def gather(self, parts: Sequence[QueryPart]) -> tuple[Indices, Array, Array]:
-        """Return index, point and normal of some points of several views, one view after the other."""
+        """Return index (N,), point (N, 3) and normal (N, 3), reference frame, of some points, view after view."""
         index = np.concatenate([self.index[v][at] for v, at in parts])
         points = np.concatenate([self.points[v][at] for v, at in parts])
         return index, points, np.concatenate([self.normals[v][at] for v, at in parts])
@@ -353,16 +355,21 @@ class NeighbourQueries:
         return distance, accept
 
     def _usable(self, w: int, index: NDArray[np.uint32]) -> NDArray[np.int32]:
-        # Where none is found its number is one beyond the last.
+        """Return the indices (N,) of found points of view w, -1 where the point is not usable or none was found."""
+        # Where none is found the tree gives the index one beyond the last.
         return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
 
     def _seen_from(self, w: int, points: Array) -> Array:
-        # The trees stay in their scanner's frame; the queries travel.
+        """Return points (N, 3) of the reference frame in the scanner frame of view w, in which its tree stands."""
         return np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
 
 
 def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
-    """Return sampled points of every view under T_reference_scanner (V, 4, 4)."""
+    """Return sampled points of every view, placed by poses T_reference_scanner (V, 4, 4), to look for partners.
+
+    Args:
+        samples: per view the indices of its points.
+    """
     placed = list(zip(scans, poses, samples, strict=True))
     points = [frames.transform(T, scan.points.take(index, axis=0)) for scan, T, index in placed]
     normals = [frames.rotate(T, scan.normals.take(index, axis=0)) for scan, T, index in placed]
@@ -382,6 +389,6 @@ def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Ar
     placed = [frames.transform(T, in_scanner) for T, in_scanner in zip(poses, points, strict=True)]
     distances = []
     for m in matches:
-        apart = placed[m.v].take(m.index_v, axis=0) - placed[m.w].take(m.index_w, axis=0)
-        distances.append(np.einsum("ij,ij->i", apart, m.normal))
+        difference = placed[m.v].take(m.index_v, axis=0) - placed[m.w].take(m.index_w, axis=0)
+        distances.append(np.einsum("ij,ij->i", difference, m.normal))
     return np.concatenate(distances)

@@ -74,8 +74,8 @@ class Overlaps(Value):
     gate: float
     targets: "TargetPairs | None" = None
     probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
-    searched: Searched | None = None  # where an iteration may go on from it
-    turns: Indices | None = None  # (V,) of the pairs, among how many points of a view they take turns
+    searched: Searched | None = None  # nearest points, for the next iteration; None: it searches all anew
+    turns: Indices | None = None  # (V,) every t-th point of a view is searched in a partner; None: `match_pairs` says
 
 
 def collect_overlaps(
@@ -128,11 +128,10 @@ def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
         gate: largest distance between corresponding points, length_unit.
     """
     assert before.probed is not None
-    T, probed_gate = before.probed
+    probed_poses, probed_gate = before.probed
     if gate < _SMALLER_GATE * probed_gate:
         return False
-    to_centre = frames.make(np.eye(3), -before.gram.centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
+    twists = frames.twists_about(before.gram.centre, probed_poses, poses)
     moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
     return bool(max(moved.max(), gate - probed_gate) < _SAME_PAIRS * min(gate, probed_gate))
 
@@ -148,8 +147,7 @@ def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Arra
         poses: (V, 4, 4) T_reference_scanner after the motion.
     """
     centre = before.gram.centre
-    to_centre = frames.make(np.eye(3), -centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ start))
+    twists = frames.twists_about(centre, start, poses)
     matches = []
     for m in before.matches:
         change = frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w])
@@ -171,12 +169,12 @@ def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
 
 
 def next_gate(overlaps: Overlaps, capture: Capture) -> float:
-    """Return the distance that partners may have, from the spacing and the residuals' robust sigma."""
+    """Return the largest distance, length_unit, that partners may have: from the spacing and the residuals' sigma."""
     return _GATE_SPACINGS * capture.spacing + _GATE_SIGMAS * overlaps.gram.scale
 
 
 def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
-    """Return the root mean square over the correspondences of all captures, inside the robust gate."""
+    """Return the rms distance, length_unit, of the correspondences of all captures, inside the robust gate."""
     square = sum(o.gram.raw_square.sum() for o in overlaps)
     return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))
 
@@ -209,18 +207,18 @@ class Gram:
 
     @property
     def rms(self) -> float:
-        """Root mean square of e inside the robust gate."""
+        """Root mean square of e inside the robust gate, length_unit."""
         return float(np.sqrt(self.raw_square.sum() / max(self.count.sum(), 1)))
 
     @property
     def lever(self) -> float:
-        """Rms distance by which a radian about `centre` displaces the correspondences along their normals."""
+        """Rms distance, length_unit, by which a radian about `centre` moves correspondences along their normals."""
         total = self.matrix.sum(axis=0)
         return float(np.sqrt(np.trace(total[:3, :3]) / max(np.trace(total[3:, 3:]), 1e-300)))
 
     @property
     def displacement_factors(self) -> Array:
-        """(6,) factors that make a twist about the centre displacements: rotations count at the lever."""
+        """(6,) factors that make of a twist about the centre displacements, length_unit: rotations times the lever."""
         return np.array([max(self.lever, 1e-300)] * 3 + [1.0] * 3)
 
     @cached_property
@@ -232,25 +230,25 @@ class Gram:
         """
         scale = np.tile(1 / self.displacement_factors, self.views)
         values, vectors = np.linalg.eigh(assemble(self, ~self.labelled)[0] * scale[:, None] * scale)
-        keep = values > NEAR_NULL * values[-1]
-        values = values[keep]
-        seen = vectors[:, keep]
+        is_seen = values > NEAR_NULL * values[-1]
+        values, by_surfaces = values[is_seen], vectors[:, is_seen]
         if not self.labelled.any():
-            return VisibleDirections(values, seen, scale, seen)
-        targets = assemble(self, self.labelled)[0] * scale[:, None] * scale
-        basis = np.hstack([seen, _target_only_directions(targets, seen)])
-        values, within = np.linalg.eigh(basis.T @ ((seen * values) @ seen.T + targets) @ basis)
+            return VisibleDirections(values, by_surfaces, scale, by_surfaces)
+        H_targets = assemble(self, self.labelled)[0] * scale[:, None] * scale
+        basis = np.hstack([by_surfaces, _target_only_directions(H_targets, by_surfaces)])
+        H = (by_surfaces * values) @ by_surfaces.T + H_targets
+        values, within = np.linalg.eigh(basis.T @ H @ basis)
         # Targets of a huge sigma leave eigenvalues that are rounding, of either sign.
-        held = values > _ROUNDING * values[-1]
-        return VisibleDirections(values[held], basis @ within[:, held], scale, seen)
+        is_seen = values > _ROUNDING * values[-1]
+        return VisibleDirections(values[is_seen], basis @ within[:, is_seen], scale, by_surfaces)
 
     def only(self, keep: Mask) -> "Gram":
-        """Return the sums of some pairs (P,)."""
+        """Return the sums of some of the pairs, by a mask (P,)."""
         return take_rows(self, keep, *_PAIR_FIELDS)
 
     @property
     def variance(self) -> float:
-        """Weighted mean of e² between surfaces."""
+        """Weighted mean of e² between surfaces, length_unit²."""
         return float(self.square[~self.labelled].sum() / max(self.weight.sum(), 1e-300))
 
 
@@ -272,13 +270,13 @@ def _target_only_directions(H: Array, vectors: Array) -> Array:
 
 
 def robust_scale(matches: Iterable[Match]) -> float:
-    """Return the robust sigma of the residuals of all pairs: they are symmetric about zero, so no centring."""
+    """Return the robust sigma, length_unit, of the residuals of all pairs about zero; NaN without pairs."""
     residuals = [m.residual for m in matches]
     return max(mad_sigma(np.concatenate(residuals)), _ROUNDING) if residuals else float("nan")
 
 
 def sum_matches(matches: Sequence[Match], views: int) -> Gram:
-    """Return the sums over pairs about the middle of their correspondences, at their own robust scale."""
+    """Return the sums of `gram` over pairs of V views, about the mean of their centroids, at their robust sigma."""
     centre = np.mean([centroid(m.middle) for m in matches], axis=0)
     return gram(matches, views, centre, robust_scale(matches))
 
@@ -361,7 +359,7 @@ class TargetPairs:
     information: Array  # (N,) w_v w_w / Σw, 1/length²
 
     def lever(self, centre: Array) -> Array:
-        """Return (N, 3, 6), what a left twist of a view about `centre` does to the target."""
+        """Return the motion (N, 3, 6) of each target per left twist of a view about `centre` (3,)."""
         turn = -frames.skew(self.place - centre)
         return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2)
 
@@ -409,19 +407,18 @@ def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) ->
     weight = g.variance * noise_factor * targets.information
     weighted = lever * weight[:, None, None]
     pairs, matrix = sum_by_pair(targets, np.einsum("nia,nib->nab", weighted, lever))
-    nothing = np.zeros(len(pairs))
-    sums: dict[str, Any] = {
+    zeros = np.zeros(len(pairs))
+    of_targets: dict[str, Any] = {
         "pairs": pairs,
         "matrix": matrix,
         "vector": sum_by_pair(targets, np.einsum("nia,ni->na", weighted, targets.difference))[1],
         "square": sum_by_pair(targets, weight * np.einsum("ni,ni->n", targets.difference, targets.difference))[1],
-        "weight": nothing,
-        "count": nothing.astype(int),
-        "raw_square": nothing,
-        "labelled": nothing == 0,
+        "weight": zeros,
+        "count": zeros.astype(int),
+        "raw_square": zeros,
+        "labelled": np.ones(len(pairs), bool),
     }
-    joined: dict[str, Any] = {name: np.concatenate([getattr(g, name), sums[name]]) for name in _PAIR_FIELDS}
-    return replace(g, **joined)
+    return replace(g, **{name: np.concatenate([getattr(g, name), of_targets[name]]) for name in _PAIR_FIELDS})
 
 
 def sum_by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:

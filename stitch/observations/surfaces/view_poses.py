@@ -20,7 +20,7 @@ from stitch.session.capture import Capture
 SAMPLES = 1500
 _MAXIMUM_ITERATIONS = 12
 _CONVERGED = 5e-3
-# Noise of a pair's scans that is so many times what is left between them is a shape, beyond what chance leaves of few.
+# Measured noise of a pair's scans that is so many times the distance left between them is a shape taken for noise.
 _MORE_THAN_LEFT = 2.0
 # The step (6V,) that was asked for, and the one that was taken, as displacements; None before the first.
 LastStep = tuple[Array, Array] | None
@@ -35,9 +35,8 @@ class UnconstrainedPoses:
     overlaps: Overlaps  # at `poses`
 
     def relative_to(self, model_poses: Array) -> "UnconstrainedPoses":
-        """The same views against another model, (V, 4, 4): where overlaps put them does not depend on it."""
-        to_centre = frames.make(np.eye(3), -self.overlaps.gram.centre)
-        return replace(self, twists=frames.log(to_centre @ self.poses @ frames.inverse(to_centre @ model_poses)))
+        """Return the same poses with their twists from other poses of a model, T_reference_scanner (V, 4, 4)."""
+        return replace(self, twists=frames.twists_about(self.overlaps.gram.centre, model_poses, self.poses))
 
 
 def unconstrained_poses(
@@ -83,14 +82,14 @@ def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array
     The step (V, 6), left twists about the centre of the overlaps, is lengthened by Anderson's rule from the step before
     (`anderson_step`): iterations of nearest neighbours stop short of where they lead.
     """
-    unit = g.displacement_factors
-    asked = (step * unit).ravel()
-    taken = asked if last is None else anderson_step(asked, *last)
-    return frames.moved_about(g.centre, taken.reshape(-1, 6) / unit, poses), (asked, taken)
+    factors = g.displacement_factors
+    proposed = (step * factors).ravel()
+    taken = proposed if last is None else anderson_step(proposed, *last)
+    return frames.moved_about(g.centre, taken.reshape(-1, 6) / factors, poses), (proposed, taken)
 
 
 def has_converged(g: Gram, step: Array, share: float) -> bool:
-    """True if a step (V, 6) moves the views by less than a share of the robust sigma, rms."""
+    """Return True if a step (V, 6) translates the views by less than a share of the robust sigma, rms."""
     return bool(np.sqrt(np.mean(step[:, 3:] ** 2)) < share * g.scale)
 
 
@@ -122,15 +121,16 @@ def solve_views(g: Gram, pair_vectors: Array) -> Array:
         g: normal equations of the views, with H⁺ in the directions that they see.
         pair_vectors: Σ w Bᵀg (P, 6, K) of each pair of views; it acts on the first view and, negative, on the second.
     """
-    pulls = []
+    sums = []
     # Surfaces and labelled points apart: their directions are judged differently.
     for keep in (~g.labelled, g.labelled):
         b = np.zeros((g.views, 6, pair_vectors.shape[2]))
         v, w = g.pairs[keep].astype(np.int64).T
         np.add.at(b, v, pair_vectors[keep])
         np.subtract.at(b, w, pair_vectors[keep])
-        pulls.append(b.reshape(6 * g.views, -1))
-    return solve_view_sums(g, *pulls)
+        sums.append(b.reshape(6 * g.views, -1))
+    by_surfaces, by_targets = sums
+    return solve_view_sums(g, by_surfaces, by_targets)
 
 
 def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
