@@ -10,6 +10,7 @@ square distance between all views that ought to meet. Objects without features (
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 
 import numpy as np
@@ -43,9 +44,8 @@ STATED, REUSED, ALONE = "given in session.toml", "of another run, used as it is"
 # First gate of the search, that of the correction from what it found, and truncation of the score: shares of the part's
 # size.
 COARSE_GATE, _FOUND_GATE, SCORE_SHARE = 0.35, 0.2, 0.05
-# Points of a view that are asked for their nearest neighbours while a hand-eye is searched.
-SEARCH_SAMPLES = 120
-_SEARCH_POINTS = 2000
+# Points of a view whose nearest neighbours are searched while a hand-eye is found, and points of a scan there.
+SEARCH_SAMPLES, _SEARCH_POINTS = 120, 2000
 # The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
 _STEPS_TO_MEET, _STEPS_AFTER = 4, 3
 # Two answers of the search whose scores differ by less than this ratio are equally good.
@@ -58,11 +58,11 @@ _STARTS = 24
 _RESTART_DEG = 15.0
 # The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
 _ANGLE_TOLERANCE = np.radians(3.0)
+# Fewer motions show no hand-eye.
 _MINIMUM_MOTIONS = 3
-_FEATURE_SPACINGS = 6.0
-_POINTS = 1500
-# One partner in twelve right leaves five good triples among so many.
-_DRAWS = 10_000
+# Registration by features: its unit of length in spacings of the points, points of a scan, and triples that RANSAC
+# draws: one partner in twelve right leaves five good triples among so many.
+_FEATURE_SPACINGS, _POINTS, _DRAWS = 6.0, 1500, 10_000
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,8 @@ class CoarseHandEye:
     gate: float  # length_unit: first distance between partners for the correction
     source: str
     candidates: tuple[HandEyeCandidate, ...]
-    _met: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    # Cache of `overlaps`, by the identity of the capture.
+    _overlaps: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def overlaps(self, capture: Capture) -> Overlaps:
         """Return the correspondences of a few points of each view under this hand-eye.
@@ -94,11 +95,11 @@ class CoarseHandEye:
         Raises:
             NoResultError: no two views overlap.
         """
-        known, overlaps = self._met.pop(id(capture), (None, None))
+        known, overlaps = self._overlaps.pop(id(capture), (None, None))
         if overlaps is None or known is not capture:
             samples = common_samples(capture.scans, COARSE_SAMPLES)
             overlaps = collect_overlaps(capture, capture.poses(self.T_mount), self.gate, samples)
-            self._met[id(capture)] = capture, overlaps
+            self._overlaps[id(capture)] = capture, overlaps
         return overlaps
 
     @property
@@ -193,22 +194,24 @@ def icp_from_starts(
         size: of the part, length_unit.
     """
     light = [replace(c, scans=tuple(subsample(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
-    met: list[tuple[list[str], Array, list[float]]] = []
+    # Per distinct hand-eye half way: the names of its starts, T_mount (4, 4) and the gates of the captures.
+    distinct: list[tuple[list[str], Array, list[float]]] = []
     for source, start in steps("trying hand-eyes", starts):
-        half = _icp_steps(light, start, [COARSE_GATE * size] * len(captures), _STEPS_TO_MEET)
-        if half is None:
+        half_way = _icp_steps(light, start, [COARSE_GATE * size] * len(captures), _STEPS_TO_MEET)
+        if half_way is None:
             continue
-        same = [sources for sources, T, _ in met if same_hand_eye(captures, size, half[0], T)]
+        same = [sources for sources, T, _ in distinct if same_hand_eye(captures, size, half_way[0], T)]
         if same:
             same[0].append(source)
         else:
-            met.append(([source], *half))
-    ends = [(sources, _icp_steps(light, T, gates, _STEPS_AFTER)) for sources, T, gates in met]
-    return [
-        HandEyeCandidate(sources[0], end[0], view_consistency(captures, end[0], SCORE_SHARE * size), len(sources))
-        for sources, end in ends
-        if end is not None
-    ]
+            distinct.append(([source], *half_way))
+    candidates = []
+    for sources, T_mount, gates in distinct:
+        end = _icp_steps(light, T_mount, gates, _STEPS_AFTER)
+        if end is not None:
+            score = view_consistency(captures, end[0], SCORE_SHARE * size)
+            candidates.append(HandEyeCandidate(sources[0], end[0], score, reached=len(sources)))
+    return candidates
 
 
 def _icp_steps(
@@ -272,26 +275,24 @@ def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) 
     """
     squares: list[float] = []
     for c in captures:
-        poses = c.poses(T_mount)
         samples = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
-        queries = neighbour_queries(c.scans, poses, samples)
-
-        # The default argument binds the queries of this capture.
-        def mean_squares(w: int, queries: NeighbourQueries = queries) -> list[float]:
-            """Return, for each other view that has samples, the mean of their squared distances to view w.
-
-            In length_unit²; a distance without a partner that faces the same way counts as `limit`.
-            """
-            parts = [(v, slice(None)) for v in range(len(queries.scans)) if v != w and len(queries.index[v])]
-            if not parts:
-                return []
-            _, points, normals = queries.gather(parts)
-            distance, facing = queries.search(w, points, normals, limit)
-            squares_by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(queries.counts(parts))[:-1])
-            return [float(np.mean(view_squares)) for view_squares in squares_by_view]
-
-        squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
+        queries = neighbour_queries(c.scans, c.poses(T_mount), samples)
+        squares += chain.from_iterable(parallel(partial(_mean_squares, queries, limit), range(len(c.scans))))
     return float(np.sqrt(np.mean(squares)))
+
+
+def _mean_squares(queries: NeighbourQueries, limit: float, w: int) -> list[float]:
+    """Return for each other view that has samples the mean squared distance of these to view w, length_unit².
+
+    A distance above `limit` (length_unit), or to a surface that faces another way, counts as `limit`.
+    """
+    parts = [(v, slice(None)) for v in range(len(queries.scans)) if v != w and len(queries.index[v])]
+    if not parts:
+        return []
+    _, points, normals = queries.gather(parts)
+    distance, has_partner = queries.search(w, points, normals, limit)
+    squares_by_view = np.split(np.where(has_partner, distance, limit) ** 2, np.cumsum(queries.counts(parts))[:-1])
+    return [float(np.mean(squares)) for squares in squares_by_view]
 
 
 def scanner_centre(captures: Sequence[Capture]) -> Array:
@@ -311,6 +312,7 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
     shifts = null_space(hidden.T) if hidden.size else np.eye(3)
 
     def hand_eye(x: Array) -> Array:
+        """Return T_mount (4, 4) for x: a rotation vector, then a translation along `shifts`."""
         return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
 
     def residual(x: Array) -> Array:
@@ -337,7 +339,7 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
 
 
 def turn_about(rotation: Array, centre: Array) -> Array:
-    """Return the (4, 4) turn by a rotation vector (3,) about a point (3,)."""
+    """Return the motion (4, 4) that rotates by a rotation vector (3,), rad, about a point (3,)."""
     T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
     T[:3, 3] = centre - T[:3, :3] @ centre
     return T
@@ -349,26 +351,21 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
     A are motions of the mount, B of the scanner. A kind with fewer than `_MINIMUM_MOTIONS` plausible motions, and a
     solver that fails, are left out.
     """
-    out: list[tuple[str, Array]] = []
+    candidates: list[tuple[str, Array]] = []
     for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
-        robot, scanner = [], []
-        for capture in captures:
-            A, B = motions(capture)
-            # Under any hand-eye both turn by the same angle: a motion that does not is a wrong registration.
-            keep = angle_differences(A, B) < _ANGLE_TOLERANCE
-            robot.append(A[keep])
-            scanner.append(B[keep])
-        A, B = np.concatenate(robot), np.concatenate(scanner)
-        if len(A) < _MINIMUM_MOTIONS:
+        A, B = (np.concatenate(of_captures) for of_captures in zip(*map(motions, captures), strict=True))
+        # Under any hand-eye both turn by the same angle: a motion that does not is a wrong registration.
+        plausible = angle_differences(A, B) < _ANGLE_TOLERANCE
+        if plausible.sum() < _MINIMUM_MOTIONS:
             continue
         for name, solver in AXXB_SOLVERS.items():
             try:
-                T_mount = solver(A, B)
+                T_mount = solver(A[plausible], B[plausible])
             except (NoResultError, np.linalg.LinAlgError):
                 continue
             if np.isfinite(T_mount).all():
-                out.append((f"{kind}, {name}", T_mount))
-    return out
+                candidates.append((f"{kind}, {name}", T_mount))
+    return candidates
 
 
 def feature_motions(capture: Capture) -> tuple[Array, Array]:
@@ -383,20 +380,22 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
 def register_pairs(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
     """Return motions (M, 4, 4) of the scanner: each maps the second view's scanner frame into the first's.
 
-    Surfaces are matched by FPFH features and RANSAC, then improved by ICP. `size` is the length, in length_unit, to
-    which radii of features and distances are scaled.
+    Surfaces are matched by FPFH features and RANSAC, then improved by ICP.
     """
+    # Radii of features and distances of partners are multiples of this length, length_unit.
     size = _FEATURE_SPACINGS * capture.spacing
 
-    def described(scan: Scan) -> FeaturedSurface:
+    def with_features(scan: Scan) -> FeaturedSurface:
+        """Return the surface of a scan, thinned, with its features."""
         points, normals = feature_matching.voxel_downsample(
             scan.points, scan.normals, max(size / 2, even_grid_size(scan.points))
         )
         return feature_matching.compute_fpfh(points, normals, 2.5 * size)
 
-    surfaces = list(parallel(described, capture.scans))
+    surfaces = list(parallel(with_features, capture.scans))
 
     def motion(pair: tuple[int, int]) -> Array:
+        """Return the motion (4, 4) that maps the scan of the second view onto that of the first."""
         target, source = (surfaces[v] for v in pair)
         T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
         return feature_matching.align_icp(source, target, T, reach=size)
@@ -405,13 +404,13 @@ def register_pairs(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
 
 
 def neighbouring_views(views: int) -> list[tuple[int, int]]:
-    """Return pairs of views one and two apart, of two views the pair."""
-    steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
-    return steps if views > 2 else [(0, 1)]
+    """Return the pairs (v, w) of views that are one or two apart in their order; of two views the one pair."""
+    pairs = [(v, v + step) for step in (1, 2) for v in range(views - step)]
+    return pairs if views > 2 else [(0, 1)]
 
 
 def even_grid_size(points: Array) -> float:
-    """Return the grid size that leaves about `_POINTS` points of a surface."""
+    """Return the edge of a grid, in the unit of points (N, 3), that leaves about `_POINTS` points of their surface."""
     extent = np.ptp(points, axis=0)
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
 

@@ -53,39 +53,41 @@ _MAXIMUM_ITERATIONS = 40
 _CONVERGED, _AT_REST = 1e-2, 0.1
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
-_TIGHTENINGS = 4
+# Rounds of matching in which the gate of a given hand-eye narrows at most; a smaller change of it ends them.
+_TIGHTENINGS, _GATE_CONVERGED = 4, 0.99
+# While the hand-eye is corrected, a gate that keeps this share of itself has settled.
+_GATE_SETTLED = 0.9
 # No scanner stands farther from its mount than so many times the size of what it sees.
 _FARTHEST = 1e3
-_GATE_CONVERGED = 0.99
 
-# From free-network poses per capture to the twists (6V, K) of each by the scanner's errors that all views repeat, by
-# source.
+# Called with the free-network poses per capture; returns by source, per capture, left twists (6V, K) of the views per
+# sigma of the scanner's errors that all views repeat.
 ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], dict[str, list[Array]]]
-# From free-network poses per capture and a hand-eye to how the robot's poses may err.
+# Called with the free-network poses per capture and a hand-eye (4, 4); returns the prior of pose errors.
 PoseErrorPrior = Callable[[Sequence[UnconstrainedPoses], Array], PoseErrors]
 
 
 @dataclass(frozen=True)
 class Correction:
-    """The model of a rig; overlaps, free-network poses and captures in the order of its sessions."""
+    """The corrected model of a rig; tuples have one entry per session."""
 
-    geometry: Model  # hand-eye and effects, maybe without how certain the hand-eye is
-    statistics: Callable[[], HandEyeFit]  # of the hand-eye: half a second of one core, and register needs none
+    geometry: Model  # hand-eye and effects; the covariance of the hand-eye may be missing, see `model`
+    statistics: Callable[[], HandEyeFit]  # computes the hand-eye's covariance, for which register need not wait
     scatter: tuple[Repeatability, ...]  # of the poses
-    overlaps: tuple[Overlaps, ...]
+    overlaps: tuple[Overlaps, ...]  # under the corrected model
     unconstrained: tuple[UnconstrainedPoses, ...]  # views moved by the overlaps alone: where register starts
-    history: tuple[float, ...]  # rms per iteration
-    captures: tuple[Capture, ...]  # without the effects in use
+    history: tuple[float, ...]  # rms per iteration, length_unit
+    captures: tuple[Capture, ...]  # with the effects in use taken out
     given: bool = False  # the model is that of another run, nothing was fitted
 
     @cached_property
     def hand_eye(self) -> HandEyeFit:
-        """Statistics of the hand-eye, found when they are first asked for."""
+        """The hand-eye with its covariance and other statistics, computed when it is first asked for."""
         return self.statistics()
 
     @property
     def model(self) -> Model:
-        """The model, with how certain its hand-eye is."""
+        """The model with the covariance of its hand-eye, which is computed for it."""
         return replace(self.geometry, covariance=self.hand_eye.covariance)
 
 
@@ -134,6 +136,7 @@ def correct(
     require_near_scanner(captures, solved.T_mount)
 
     def statistics() -> HandEyeFit:
+        """Return the hand-eye of the last solution with its covariance."""
         common = None if scanner_errors is None else scanner_errors(unconstrained)
         errors = None if pose_error_prior is None else pose_error_prior(unconstrained, T_first)
         return fit_hand_eye(captures, unconstrained, T_first, scanner_errors=common, errors=errors, solved=solved)
@@ -197,26 +200,29 @@ def icp_hand_eye(
     history: list[float] = []
     part = seen_part(captures)
     before: Sequence[Overlaps | None] = [None] * len(captures)
-    closing = True
+    # Few points do while the gates are wide, until the hand-eye has come to rest with these.
+    few_points_do = True
     for index in range(maximum):
-        wide = closing and all(gate > _WIDE_SPACINGS * c.spacing for c, gate in zip(captures, gates, strict=True))
+        is_wide = few_points_do and all(
+            gate > _WIDE_SPACINGS * c.spacing for c, gate in zip(captures, gates, strict=True)
+        )
         if first is not None and index == 0:
             overlaps = list(first)
         else:
-            views = zip(captures, gates, coarse_queries if wide else fine_queries, before, strict=True)
-            overlaps = [collect_overlaps(c, c.poses(T_mount), gate, queries, last) for c, gate, queries, last in views]
+            inputs = zip(captures, gates, coarse_queries if is_wide else fine_queries, before, strict=True)
+            overlaps = [collect_overlaps(c, c.poses(T_mount), gate, queries, last) for c, gate, queries, last in inputs]
         before = overlaps
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount, visible_twists(captures, T_mount, part))
         T_mount = T_mount @ frames.exp(xi)
         tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
-        settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
-        if moved < _CONVERGED and settled:
-            if not wide:
+        gates_settled = all(new > _GATE_SETTLED * old for new, old in zip(tighter, gates, strict=True))
+        if moved < _CONVERGED and gates_settled:
+            if not is_wide:
                 break
             # The gate is still wide, as where surfaces agree badly: go on with all points before it ends.
-            closing = False
+            few_points_do = False
         gates = tighter if moved < _AT_REST else next_gates(captures, overlaps)
     return T_mount, overlaps, history
 
@@ -344,4 +350,5 @@ def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
 
 
 def _fine_samples(capture: Capture) -> list[Indices]:
+    """Return per view the numbers of its points that are searched for the final normal equations."""
     return [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]

@@ -43,7 +43,7 @@ _SEARCH_ANEW = 0.3
 
 @dataclass(frozen=True)
 class LiveFit:
-    """Hand-eye and views as far as they are known."""
+    """The fit of the views that have come so far: hand-eye, and the poses that their overlaps alone give them."""
 
     capture: Capture
     T_mount: Array  # (4, 4) T_mount_scanner
@@ -57,7 +57,8 @@ class LiveFit:
         return self.unconstrained.overlaps.gate
 
 
-# From a capture, its free-network poses and a hand-eye to how the poses may err, and to the scanner's errors by source.
+# Called with a capture, its free-network poses and a hand-eye (4, 4); returns the prior of pose errors, and the
+# scanner's errors by source, as `fit_hand_eye` takes them.
 ErrorPrior = Callable[[Capture, UnconstrainedPoses, Array], tuple[PoseErrors, dict[str, list[Array]]]]
 
 
@@ -99,16 +100,16 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
         matches = _match_last(capture, poses, gate, samples)
         if np.linalg.norm(step * g.displacement_factors) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
             break
-    together = _solve_together(capture, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
-    moved = np.linalg.norm(frames.log(frames.inverse(poses) @ together.poses)[:, 3:], axis=1)
-    seen = np.unique(np.concatenate([m.index_w for m in matches]))
+    solved = _solve_together(capture, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
+    moved = np.linalg.norm(frames.log(frames.inverse(poses) @ solved.poses)[:, 3:], axis=1)
+    matched = np.unique(np.concatenate([m.index_w for m in matches]))
     fitted = replace(
         fit,
         capture=capture,
-        unconstrained=together.relative_to(model_poses),
+        unconstrained=solved.relative_to(model_poses),
         drifted=fit.drifted + float(moved[:-1].max(initial=0.0)),
     )
-    return fitted, float(np.isin(samples[last], seen).mean())
+    return fitted, float(np.isin(samples[last], matched).mean())
 
 
 def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:
@@ -145,8 +146,8 @@ def without_view(fit: LiveFit, view: int) -> LiveFit:
     if not matches:
         raise NoResultError(f"{capture.name}: no two views overlap")
     poses = np.delete(fit.unconstrained.poses, view, axis=0)
-    together = _solve_together(capture, poses, matches, old.gate)
-    return replace(fit, capture=capture, unconstrained=together.relative_to(capture.poses(fit.T_mount)))
+    solved = _solve_together(capture, poses, matches, old.gate)
+    return replace(fit, capture=capture, unconstrained=solved.relative_to(capture.poses(fit.T_mount)))
 
 
 def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> list[Match]:
@@ -162,8 +163,8 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
     """
     last = len(poses) - 1
     pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
-    least = MINIMUM_OVERLAP * len(samples[last])
-    matches = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > least]
+    fewest = MINIMUM_OVERLAP * len(samples[last])
+    matches = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > fewest]
     if not matches:
         raise NoResultError(f"{capture.scans[last].name}: it shares no surface with the other views")
     return matches
@@ -194,8 +195,8 @@ def _solve_together(capture: Capture, poses: Array, matches: list[Match], gate: 
     points = [scan.points for scan in capture.scans]
     for _ in range(2):
         ends = np.cumsum([len(m.residual) for m in matches])[:-1]
-        apart = np.split(signed_distances(matches, poses, points), ends)
-        matches = [replace(m, residual=e) for m, e in zip(matches, apart, strict=True)]
+        residuals = np.split(signed_distances(matches, poses, points), ends)
+        matches = [replace(m, residual=e) for m, e in zip(matches, residuals, strict=True)]
         g = sum_matches(matches, len(poses))
         step = visible_step(g)
         poses = frames.moved_about(g.centre, step, poses)

@@ -19,6 +19,7 @@ from stitch.session.axes import Axis
 from stitch.session.measurement import Measurement
 from stitch.system.values import Value
 
+# Step of differences, rad or length_unit: far above rounding, far below the bend of any angle.
 _STEP = 1e-6
 
 
@@ -70,27 +71,26 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
     term = next((term for term in model.terms if term.name == PLACEMENT), None)
     near = _middle(measurement, model)
     names = [] if term is None else [f"{term.name}.{p.name}" for p in term.parameters]
-    steps, covariance = _joint_covariance(model, names)
+    covariance = _covariance_with_hand_eye(model, names)
     places = []
     for k, axis in enumerate(axes.axes):
-        here = _as_stated(measurement, model, term, k, near)
-        J = np.array(
-            [(_as_stated(measurement, *_moved(model, term, step), k, near) - here) / _STEP for step in steps]
-        ).reshape(len(steps), 6)
+        place = _as_stated(measurement, model, term, k, near)
+        moved = [_as_stated(measurement, *_moved(model, term, s), k, near) for s in _STEP * np.eye(len(covariance))]
+        # Derivatives of direction and point (6,) by the hand-eye's twist and the parameters, one a row.
+        J = (np.array(moved) - place) / _STEP
         sigma = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", J, covariance, J), 0.0))
         no_sigma, unobservable = _unseen(axis, term, has_robot=axes.has_robot, is_frame_axis=k == axes.frame_axis)
         sigma[:3][no_sigma[0]] = np.nan
         sigma[3:][no_sigma[1]] = np.nan
-        point, point_sigma = (here[3:], sigma[3:]) if axis.is_rotary else (None, None)
-        places.append(AxisPlace(axis.name, axis.kind, here[:3], sigma[:3], point, point_sigma, unobservable))
+        point, point_sigma = (place[3:], sigma[3:]) if axis.is_rotary else (None, None)
+        places.append(AxisPlace(axis.name, axis.kind, place[:3], sigma[:3], point, point_sigma, unobservable))
     return tuple(places)
 
 
-def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
-    """Return steps for differences, one a row (6 + P, 6 + P), and the covariance (6 + P, 6 + P) of what is stepped.
+def _covariance_with_hand_eye(model: Model, names: list[str]) -> Array:
+    """Return the covariance (6 + P, 6 + P) of the hand-eye's twist, T·exp(ξ), and of P parameters of axis_placement.
 
-    The first six are the hand-eye's twist T·exp(ξ), the others the parameters of axis_placement; zero covariance for
-    those that were not fitted.
+    Rows of parameters that were not fitted are zero.
 
     Args:
         names: effect.parameter of the P parameters.
@@ -98,16 +98,15 @@ def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
     known = model.effects_covariance
     size = 6 + len(names)
     covariance = np.zeros((size, size))
-    beside = known.with_hand_eye
-    covariance[:6, :6] = beside[:, :6] if beside.size else model.covariance
+    covariance[:6, :6] = known.with_hand_eye[:, :6] if known.with_hand_eye.size else model.covariance
     fitted = [i for i, name in enumerate(names) if name in known.names]
     rows = 6 + np.array(fitted, int)
-    at = np.array([known.names.index(names[i]) for i in fitted], int)
-    covariance[np.ix_(rows, rows)] = known.matrix[np.ix_(at, at)]
-    if beside.size:
-        covariance[:6, rows] = beside[:, 6 + at]
-        covariance[rows, :6] = beside[:, 6 + at].T
-    return _STEP * np.eye(size), covariance
+    index = np.array([known.names.index(names[i]) for i in fitted], int)
+    covariance[np.ix_(rows, rows)] = known.matrix[np.ix_(index, index)]
+    if known.with_hand_eye.size:
+        covariance[:6, rows] = known.with_hand_eye[:, 6 + index]
+        covariance[rows, :6] = covariance[:6, rows].T
+    return covariance
 
 
 def _moved(model: Model, term: Term | None, step: Array) -> tuple[Model, Term | None]:
@@ -140,18 +139,17 @@ def _as_stated(measurement: Measurement, model: Model, term: Term | None, k: int
 
 def _middle(measurement: Measurement, model: Model) -> Array:
     """Return the mean (3,) over the views of their points: reference frame, without a robot the scanner's."""
-    shown = [points.mean(axis=0) for points in measurement.capture.visible_points if len(points)]
-    if not measurement.views.axes.has_robot:
-        return np.asarray(np.mean(shown, axis=0))
-    views = zip(measurement.capture.poses(model.T_mount), measurement.capture.visible_points, strict=True)
-    placed = [frames.transform(T, points).mean(axis=0) for T, points in views if len(points)]
-    return np.asarray(np.mean(placed, axis=0))
+    clouds = measurement.capture.visible_points
+    if measurement.views.axes.has_robot:
+        poses = measurement.capture.poses(model.T_mount)
+        clouds = [frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)]
+    return np.asarray(np.mean([points.mean(axis=0) for points in clouds if len(points)], axis=0))
 
 
 def _unseen(
     axis: Axis, term: Term | None, *, has_robot: bool, is_frame_axis: bool
 ) -> tuple[tuple[bool, bool], tuple[str, ...]]:
-    """Return (direction, point): True where it has no sigma; and words for what the views do not show.
+    """Return whether direction and point of an axis have no sigma, and in words what of it the views do not show.
 
     Args:
         term: axis_placement; None: it was not fitted.

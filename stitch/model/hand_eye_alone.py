@@ -62,5 +62,5 @@ def hand_eye_alone(measurement: Measurement, model: Model) -> HandEyeAlone | Non
 
 
 def _as_in_the_end(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms with events before the first view."""
+    """Return the terms as they are after the last view: an event counts as if it were before the first."""
     return [term.at(np.array([0.0 if p.discrete else p.value for p in term.parameters])) for term in terms]

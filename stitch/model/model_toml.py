@@ -308,6 +308,7 @@ def without_events(file: ModelFile) -> ModelFile:
 
 
 def _moved_target(target: Target, T: Array) -> Target:
+    """Return a target moved by T (4, 4) in the reference frame."""
     orientation = None if target.orientation is None else T[:3, :3] @ target.orientation
     return replace(target, position=frames.transform(T, target.position), orientation=orientation)
 

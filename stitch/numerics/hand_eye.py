@@ -73,14 +73,14 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
     # Lengths and rotation entries share one system: count lengths in units of the motions.
     unit = float(np.linalg.norm(weight_roots(A, weights)[:, None] * B[:, :3, 3])) or 1.0
     # Rows: vec R − (R_A ⊗ R_B) vec R = 0 and (1 ⊗ t_Bᵀ) vec R + (1 − R_A) t = t_A, with row-major vec.
-    turned, moved, right = [], [], []
+    of_rotation, of_translation, right = [], [], []
     for a, b, root in zip(A, B, weight_roots(A, weights), strict=True):
-        turned += [root * (np.eye(9) - np.kron(a[:3, :3], b[:3, :3])), root * np.kron(eye, b[None, :3, 3]) / unit]
-        moved += [np.zeros((9, 3)), root * (eye - a[:3, :3])]
+        of_rotation += [root * (np.eye(9) - np.kron(a[:3, :3], b[:3, :3])), root * np.kron(eye, b[None, :3, 3]) / unit]
+        of_translation += [np.zeros((9, 3)), root * (eye - a[:3, :3])]
         right += [np.zeros(9), root * a[:3, 3] / unit]
-    system, target, shift = np.vstack(turned), np.concatenate(right), np.linalg.qr(np.vstack(moved))[0]
+    system, target, Q = np.vstack(of_rotation), np.concatenate(right), np.linalg.qr(np.vstack(of_translation))[0]
     # The translation is eliminated; what it cannot explain is left for the rotation.
-    system, target = system - shift @ (shift.T @ system), target - shift @ (shift.T @ target)
+    system, target = system - Q @ (Q.T @ system), target - Q @ (Q.T @ target)
     vec = minimise_on_sphere(system.T @ system, system.T @ target, np.sqrt(3.0)).reshape(3, 3)
     # Without t_A both signs of vec R solve the system; a rotation has determinant +1.
     R = frames.nearest_rotation(vec * np.sign(np.linalg.det(vec)))
@@ -171,10 +171,10 @@ def minimise_on_sphere(H: Array, g: Array, radius: float) -> Array:
     n = len(H)
     block = np.block([[H, -np.eye(n)], [-np.outer(g, g) / radius**2, H]])
     values, vectors = np.linalg.eigh(H)
-    real = np.linalg.eigvals(block).real
-    gap = np.maximum(values - min(float(real.min()), values[0]), 0)
-    along = vectors.T @ g
-    x = np.where(gap > 1e-12 * values[-1], along / np.maximum(gap, 1e-300), 0.0)
+    multiplier = min(float(np.linalg.eigvals(block).real.min()), values[0])
+    gap = np.maximum(values - multiplier, 0)
+    # In the eigenvectors of H.
+    x = np.where(gap > 1e-12 * values[-1], vectors.T @ g / np.maximum(gap, 1e-300), 0.0)
     # Where g has no part along the first eigenvector, the rest of the length lies there.
     if gap[0] <= 1e-12 * values[-1]:
         x[0] = np.sqrt(max(radius**2 - float(x @ x), 0.0))
@@ -206,17 +206,17 @@ def matched_rotations(A: Array, B: Array) -> tuple[Array, Array]:
         NoResultError: half turns about two axes that fit two different hand-eyes.
     """
     alpha, beta = frames.log(A)[:, :3], frames.log(B)[:, :3]
-    length = np.linalg.norm(beta, axis=1)
-    is_open = np.maximum(length, np.linalg.norm(alpha, axis=1)) > np.pi - _HALF_TURN
-    if not is_open.any():
+    angle = np.linalg.norm(beta, axis=1)
+    is_half_turn = np.maximum(angle, np.linalg.norm(alpha, axis=1)) > np.pi - _HALF_TURN
+    if not is_half_turn.any():
         return alpha, beta
-    beyond = beta * (1 - 2 * np.pi / np.maximum(length, 1e-12))[:, None]
-    R = _crude_rotation(A, B, alpha, beta, is_open)
-    worse = np.linalg.norm(alpha - beta @ R.T, axis=1) > np.linalg.norm(alpha - beyond @ R.T, axis=1)
-    return alpha, np.where((is_open & worse)[:, None], beyond, beta)
+    opposite = beta * (1 - 2 * np.pi / np.maximum(angle, 1e-12))[:, None]
+    R = _crude_rotation(A, B, alpha, beta, is_half_turn)
+    is_worse = np.linalg.norm(alpha - beta @ R.T, axis=1) > np.linalg.norm(alpha - opposite @ R.T, axis=1)
+    return alpha, np.where((is_half_turn & is_worse)[:, None], opposite, beta)
 
 
-def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_open: Array) -> Array:
+def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_half_turn: Array) -> Array:
     """Return R (3, 3) with α ≈ R β, from two motions: the widest turn, and the one most across it.
 
     A motion near a half turn leaves the sign of its axis open: of the two or four rotations that result, the one that
@@ -225,14 +225,14 @@ def _crude_rotation(A: Array, B: Array, alpha: Array, beta: Array, is_open: Arra
     Args:
         A, B: (M, 4, 4) motions.
         alpha, beta: (M, 3) their rotation vectors, rad.
-        is_open: (M,) motions near a half turn.
+        is_half_turn: (M,) mask of the motions near a half turn.
 
     Raises:
         NoResultError: a clearly different rotation fits nearly as well.
     """
     i = int(np.linalg.norm(alpha, axis=1).argmax())
     j = int(np.linalg.norm(np.cross(alpha, alpha[i]), axis=1).argmax())
-    signs = [(1.0, -1.0) if is_open[k] else (1.0,) for k in (i, j)]
+    signs = [(1.0, -1.0) if is_half_turn[k] else (1.0,) for k in (i, j)]
     candidates = [_triad(alpha[i], alpha[j], s * beta[i], u * beta[j]) for s, u in product(*signs)]
     scores = np.array([_misfit(A, B, R) for R in candidates])
     order = np.argsort(scores)

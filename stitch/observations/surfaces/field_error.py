@@ -61,12 +61,12 @@ class FieldMap:
 
     @property
     def rms(self) -> float:
-        """Of the error, over what was seen of the field."""
+        """Root mean square of the error over the places that were seen, length_unit."""
         return float(np.sqrt(np.nanmean(self.error**2)))
 
     @property
     def uncertainty(self) -> float:
-        """Rms of the standard uncertainty over the same."""
+        """Root mean square of the standard uncertainty over these places, length_unit."""
         return float(np.sqrt(np.nanmean(self.sigma**2)))
 
 
@@ -74,17 +74,17 @@ class FieldMap:
 class FieldError:
     """Errors along the ray that are smooth over the scanner's field; rms in length_unit, 0 where not unusual."""
 
-    rms: float  # of what is the same in every view
-    rms_by_view: float  # of what every view has for itself
-    gain: float  # nats by which the clearer of both is likelier than the largest that every scanner has
-    over_noise: bool  # one of the two is more systematic than random
-    by_view: bool = False  # the second is the clearer
-    with_time: bool = False  # it follows the session
-    map: FieldMap | None = field(default=None, compare=False, repr=False)  # where the first is the clearer
+    rms: float  # of errors that are the same in every view
+    rms_by_view: float  # of errors that every view has for itself
+    gain: float  # log likelihood ratio, nats, of the clearer of both against the largest size that every scanner has
+    over_noise: bool  # one of the two is larger than the scanner's noise
+    by_view: bool = False  # those by view are the clearer
+    with_time: bool = False  # those by view have a trend over the session
+    map: FieldMap | None = field(default=None, compare=False, repr=False)  # where those of all views are the clearer
 
     @property
     def unusual(self) -> bool:
-        """Larger than every scanner's."""
+        """True if one of the two errors is larger than every scanner has."""
         return self.rms > 0 or self.rms_by_view > 0
 
 
@@ -112,14 +112,14 @@ def field_error(
     if not np.isfinite(noise):
         return FieldError(0.0, 0.0, 0.0, over_noise=False)
     nuisance = sum(len(term.parameters) for term in nuisance_effects)
-    each = view_error_likelihood(sums, unconstrained, noise, nuisance)
+    by_causes = view_error_likelihood(sums, unconstrained, noise, nuisance)
     # Two questions, each at half of the level.
-    changing = _cause_size(each, PER_VIEW, alpha / 2)
+    per_view = _cause_size(by_causes, PER_VIEW, alpha / 2)
     # Shared errors come first unless the others are clearer: large shared errors move points to other partners, which
     # looks like errors of single views.
-    alone = changing.share > 0 and changing.gain > _shared_error_gain(each)
-    if alone:
-        same = _cause_size(each, SHARED, alpha / 2)
+    per_view_is_clearer = per_view.share > 0 and per_view.gain > _shared_error_gain(by_causes)
+    if per_view_is_clearer:
+        shared = _cause_size(by_causes, SHARED, alpha / 2)
     else:
         # COARSE shapes over the field, one over incidence, and the nuisance effects; finer shapes are left out.
         together = sums.merge_sides(per_view=COARSE)
@@ -127,27 +127,27 @@ def field_error(
         coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
         twists = apparent_twists(coarse, unconstrained)
         likelihood = shared_error_likelihood(coarse, twists, unconstrained, noise, nuisance)
-        same = _cause_size(likelihood, SHARED, alpha / 2)
-    by_view = alone or (changing.share > 0 and not same.share)
+        shared = _cause_size(likelihood, SHARED, alpha / 2)
+    by_view = per_view_is_clearer or (per_view.share > 0 and not shared.share)
     return FieldError(
-        noise * same.share,
-        noise * changing.share,
-        max(same.gain, changing.gain),
-        same.over_noise or changing.over_noise,
-        by_view,
-        changing.share > 0 and _follows_time(each.estimate(PER_VIEW, changing.shares), alpha),
-        field_map(measurement, sums, unconstrained, noise, nuisance) if same.share and not by_view else None,
+        rms=noise * shared.share,
+        rms_by_view=noise * per_view.share,
+        gain=max(shared.gain, per_view.gain),
+        over_noise=shared.over_noise or per_view.over_noise,
+        by_view=by_view,
+        with_time=per_view.share > 0 and _follows_time(by_causes.estimate(PER_VIEW, per_view.shares), alpha),
+        map=field_map(measurement, sums, unconstrained, noise, nuisance) if shared.share and not by_view else None,
     )
 
 
 @dataclass(frozen=True)
 class _CauseSize:
-    """Of errors of one cause, in units of the noise."""
+    """How large errors of one cause are, as shares of the scanner's noise, and how clearly."""
 
-    share: float  # 0 where not unusual
+    share: float  # 0 where not significantly above `ALARM_SHARE`
     shares: Array  # (C,) the likeliest of all causes
-    gain: float
-    over_noise: bool
+    gain: float  # log likelihood, nats, over that with at most `ALARM_SHARE`
+    over_noise: bool  # significantly above the noise
 
 
 def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> _CauseSize:
@@ -160,20 +160,23 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
         cause: SHARED, INCIDENCE or PER_VIEW, a number of `likelihood.design`.
     """
 
-    def clear(gain: float) -> bool:
-        # The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
-        return 0.5 * chi2_tail(2 * gain, 1) < alpha
-
     shares, free = likelihood.ml_shares()
 
-    def nats(share: float) -> float:
-        """Return how much log likelihood is lost if the cause has at most this share."""
-        return 0.5 * (likelihood.ml_shares({cause: share})[1] - free)
+    def gain_over(limit: float) -> float:
+        """Return the log likelihood, nats, that is lost if the cause has at most this share."""
+        return 0.5 * (likelihood.ml_shares({cause: limit})[1] - free)
 
-    gain = nats(ALARM_SHARE)
-    if not clear(gain):
+    def is_significant(gain: float) -> bool:
+        """Return True if a loss of log likelihood is significant at level `alpha`.
+
+        The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
+        """
+        return 0.5 * chi2_tail(2 * gain, 1) < alpha
+
+    gain = gain_over(ALARM_SHARE)
+    if not is_significant(gain):
         return _CauseSize(0.0, shares, gain, over_noise=False)
-    return _CauseSize(float(shares[cause]), shares, gain, clear(nats(1.0)))
+    return _CauseSize(float(shares[cause]), shares, gain, is_significant(gain_over(1.0)))
 
 
 def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
@@ -198,9 +201,10 @@ def _follows_time(errors: Array, alpha: float) -> bool:
     errors = errors.reshape(parts, -1)
     order = np.arange(parts) - (parts - 1) / 2
     generator = np.random.default_rng(parts)
-    others = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
+    permuted = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
     trend = np.linalg.norm(order @ errors)
-    return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS) < alpha)
+    p = (1 + np.sum(np.linalg.norm(permuted @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS)
+    return bool(p < alpha)
 
 
 def field_map(
@@ -276,10 +280,10 @@ def _field_share(likelihood: SmoothErrorLikelihood, values: Array) -> float:
     Args:
         values: (K,) coefficients of the first cause, of which the first FINE are along the ray over the field.
     """
-    whole = likelihood.design[0] @ values
-    rest = whole - likelihood.design[0][:, :FINE] @ values[:FINE]
-    squares = [float(np.sum(left**2 / likelihood.scatter)) for left in (rest, whole)]
-    return 1 - squares[0] / squares[1] if squares[1] > 0 else 0.0
+    effect = likelihood.design[0] @ values
+    rest = effect - likelihood.design[0][:, :FINE] @ values[:FINE]
+    chi2, chi2_of_rest = (float(np.sum(x**2 / likelihood.scatter)) for x in (effect, rest))
+    return 1 - chi2_of_rest / chi2 if chi2 > 0 else 0.0
 
 
 def robust_pass_share(overlaps: Overlaps) -> float:

@@ -87,20 +87,24 @@ def _best_of(shares: Array, meet: Mask) -> Mask:
         meet: (V, V) True for pairs that overlap.
     """
     kept = meet & (_leverage(np.where(meet, shares, 0.0)) > _IRREPLACEABLE)
-    for v, of_view in enumerate(meet):
-        partners = np.flatnonzero(of_view)
-        order = partners[np.argsort(-shares[v, partners], kind="stable")]
-        rest = order[_BEST:]
-        spread = rest[((np.arange(_SPREAD) + 0.5) * len(rest) / _SPREAD).astype(int)] if len(rest) > _SPREAD else rest
-        kept[v, order[:_BEST]] = kept[v, spread] = True
+    for v, meets_v in enumerate(meet):
+        partners = np.flatnonzero(meets_v)
+        best_first = partners[np.argsort(-shares[v, partners], kind="stable")]
+        rest = best_first[_BEST:]
+        if len(rest) > _SPREAD:
+            rest = rest[((np.arange(_SPREAD) + 0.5) * len(rest) / _SPREAD).astype(int)]
+        kept[v, best_first[:_BEST]] = kept[v, rest] = True
     return np.asarray(kept | kept.T)
 
 
 def _leverage(weights: Array) -> Array:
-    """Return the share (V, V) that each edge of a graph has in what holds its two ends together; 1 of a bridge.
+    """Return the effective resistance (V, V) of each edge of a graph, times its weight (Spielman & Srivastava 2011).
 
-    It is the edge's effective resistance times its weight (V, V) (Spielman & Srivastava 2011).
+    It is the share that the edge has in all that holds its two ends together: 1 of a bridge.
+
+    Args:
+        weights: (V, V) symmetric, zero on the diagonal and where there is no edge.
     """
-    inverse = np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights, hermitian=True)
-    diagonal = np.diag(inverse)
-    return np.asarray(weights * (diagonal[:, None] + diagonal - 2 * inverse))
+    laplacian_inverse = np.linalg.pinv(np.diag(weights.sum(axis=1)) - weights, hermitian=True)
+    diagonal = np.diag(laplacian_inverse)
+    return np.asarray(weights * (diagonal[:, None] + diagonal - 2 * laplacian_inverse))

@@ -25,16 +25,17 @@ from stitch.observations.surfaces.normal_equations import Gram
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums, visible_step
 from stitch.session.measurement import Measurement
 
-# Along the ray; finer ones only where views may have errors for themselves, which are not to explain what all share.
+# Degree of the polynomials over the field; finer ones are added only where views may have errors of their own, so that
+# these do not explain what all views share.
 _DEGREE, _FINE_DEGREE = 3, 6
-# Corners are seen by few points.
+# The field ends where this share of the points lies within: corners are seen by few points.
 _FIELD_QUANTILE = 0.98
 _LEGENDRE_ORDERS = sorted(
     ((i, j) for i in range(_FINE_DEGREE + 1) for j in range(_FINE_DEGREE + 1) if 0 < i + j <= _FINE_DEGREE), key=sum
 )
-# Along the ray over the field, coarse ones first; the slope with incidence follows them.
+# Number of Legendre products up to `_DEGREE`, the coarse shapes, which come first.
 COARSE = sum(sum(order) <= _DEGREE for order in _LEGENDRE_ORDERS)
-# With the finer ones, which come first of what all views may have in common besides.
+# Number of all, coarse and finer.
 FINE = len(_LEGENDRE_ORDERS)
 # The causes of `view_error_likelihood`: over the field the same in every view, over incidence, over the field view by
 # view.
@@ -85,7 +86,7 @@ def field_scatter(
     Args:
         share: rms of the errors as a share of the scanner's noise; None: estimated from the overlaps.
     """
-    every = []
+    columns = []
     for views in measurement.views.scanners.masks(measurement.views.count):
         sums, noise = sum_smooth_errors(measurement, unconstrained, views=views)
         twists = apparent_twists(sums, unconstrained)
@@ -96,8 +97,8 @@ def field_scatter(
         else:
             field, incidence = shared_error_likelihood(sums, twists, unconstrained, noise).map_shares
             sizes = noise * np.append(np.full(twists.shape[1] - 1, field), incidence)
-        every.append(twists * sizes)
-    return np.hstack(every)
+        columns.append(twists * sizes)
+    return np.hstack(columns)
 
 
 def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -> Array:
@@ -118,9 +119,11 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
     is_own = np.array(scanners.masks(len(capture.scans)))
 
     def scaled(v: int, index: Indices) -> Array:
+        """Return what undoes a unit of each scanner's scale for points of view v, (K, N, 3), scanner frame."""
         return -capture.scans[v].points[index] * is_own[:, v, None, None]
 
     def scaled_targets() -> Array:
+        """Return the same for all labelled points, (K, V, S, 3)."""
         assert capture.sightings is not None
         return -np.nan_to_num(capture.sightings.points) * is_own[:, :, None, None]
 
@@ -148,10 +151,10 @@ def sum_smooth_errors(
         views: (V,) bool, the views of the one scanner that has the errors; None: all have them.
     """
     capture = measurement.capture
-    own = np.ones(len(unconstrained.poses), bool) if views is None else views
-    half = half_field(measurement, own)
+    has_errors = np.ones(len(unconstrained.poses), bool) if views is None else views
+    half = half_field(measurement, has_errors)
     further = point_effects or PointSlopes(measurement, ())
-    scans = [scan for scan, has_them in zip(capture.scans, own, strict=True) if has_them]
+    scans = [scan for scan, has_them in zip(capture.scans, has_errors, strict=True) if has_them]
     standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in scans])))
 
     def corrections(away: Array, cosine: Array) -> Array:
@@ -163,17 +166,17 @@ def sum_smooth_errors(
         """Return how unit parameters move points of view v, (K, N, 3), scanner frame."""
         scan = capture.scans[v]
         smooth = corrections(scan.points.take(index, axis=0) - scan.eye, measurement.scan_views[v].cosine[index])
-        smooth = smooth if own[v] else np.zeros_like(smooth)
+        smooth = smooth if has_errors[v] else np.zeros_like(smooth)
         return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
 
     def of_targets() -> Array:
         """Return how unit errors move the labelled points (K, V, S, 3), sensor frame, length_unit."""
         assert capture.sightings is not None
-        points, seen = capture.sightings.points, capture.sightings.target >= 0
-        # An empty slot has no ray; nobody knows at what slant a target was seen.
-        flat = np.where(seen[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
-        moved = corrections(flat, np.ones(len(flat))).reshape(-1, *points.shape)
-        smooth = np.where((seen & own[:, None])[..., None], moved, 0.0)
+        points, is_filled = capture.sightings.points, capture.sightings.target >= 0
+        # An empty slot gets some ray; the incidence is taken as straight, since nobody knows it.
+        rays = np.where(is_filled[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
+        moved = corrections(rays, np.ones(len(rays))).reshape(-1, *points.shape)
+        smooth = np.where((is_filled & has_errors[:, None])[..., None], moved, 0.0)
         return np.concatenate([smooth, further.at_targets(unconstrained.poses)])
 
     sums = stream_point_sums(unconstrained, capture.noise_factor, of_points, of_targets, COARSE if per_view else 0)
@@ -223,10 +226,11 @@ def _shared_shapes(away: Array, half: Array, standoff: float) -> Array:
         standoff: median range, length_unit, from which the range is counted as a share.
     """
     ray = away / np.linalg.norm(away, axis=1)[:, None]
-    far = np.linalg.norm(away, axis=1) / standoff - 1
+    distance = np.linalg.norm(away, axis=1) / standoff - 1
     a, b = away[:, :2].T / away[:, 2] / half[:, None]
-    along = [*legendre_products(away, half)[COARSE:], far, far**2, far**3, far * a, far * b]
-    across = [shape[:, None] * axis for shape in (a, b, a**2, a * b, b**2, far) for axis in np.eye(3)[:2]]
+    fine = legendre_products(away, half)[COARSE:]
+    along = [*fine, distance, distance**2, distance**3, distance * a, distance * b]
+    across = [shape[:, None] * axis for shape in (a, b, a**2, a * b, b**2, distance) for axis in np.eye(3)[:2]]
     return np.concatenate([np.array(along)[..., None] * ray, np.array(across)])
 
 
@@ -248,14 +252,14 @@ def legendre_products(away: Array, half: Array, degree: int = _FINE_DEGREE) -> l
 
 @dataclass(frozen=True)
 class SmoothErrorLikelihood:
-    """What smooth errors of C causes leave within the overlaps, beside free poses, and how likely each size is.
+    """The likelihood of the sizes of smooth errors of C causes, from what they leave in overlaps beside free poses.
 
-    Errors f of variances S change the normal equations there by M f: Mf + noise is N(0, M S M + cσ²M). The causes
-    need not be equally large.
+    Errors f of variances S change the normal equations by M f: Mf + noise is N(0, M S M + cσ²M). Every cause has a size
+    of its own, a share of the scanner's noise.
     """
 
-    data: Array  # (n,) in the directions that the overlaps show
-    design: tuple[Array, ...]  # (n, K_c) per cause, for errors as large as the noise
+    data: Array  # (n,) right-hand side of the normal equations, along the eigenvectors of M that the overlaps show
+    design: tuple[Array, ...]  # (n, K_c) per cause, change of `data` by its errors where they are as large as the noise
     scatter: Array  # (n,) variances of `data` without errors
 
     @property
@@ -340,11 +344,11 @@ class SmoothErrorLikelihood:
     def _deviance(self, log_shares: Array) -> tuple[float, Array]:
         """Return −2 log likelihood at logarithms of the shares (C,), and its slopes (C,) in these."""
         parts = [np.exp(2 * log_share) * t @ t.T for log_share, t in zip(log_shares, self.design, strict=True)]
-        spread = sum(parts, np.diag(self.scatter))
-        inverse = np.linalg.inv(spread)
-        weighed = inverse @ self.data
-        slopes = [2 * (np.sum(inverse * part) - weighed @ part @ weighed) for part in parts]
-        return float(np.linalg.slogdet(spread)[1] + self.data @ weighed), np.array(slopes)
+        covariance = sum(parts, np.diag(self.scatter))
+        inverse = np.linalg.inv(covariance)
+        weighted = inverse @ self.data
+        slopes = [2 * (np.sum(inverse * part) - weighted @ part @ weighted) for part in parts]
+        return float(np.linalg.slogdet(covariance)[1] + self.data @ weighted), np.array(slopes)
 
 
 def shared_error_likelihood(
@@ -360,15 +364,14 @@ def shared_error_likelihood(
     """
     g = unconstrained.overlaps.gram
     of_view = twists.reshape(g.views, 6, -1)
-    # Σ g gᵀ less the part that motions of the views absorb. The iteration of the views ended a small step short of
-    # where they agree best: the same step is taken off Σ g e.
     v, w = g.pairs.T
-    followed = np.einsum("pik,pil->kl", sums.vector, of_view[v] - of_view[w])
+    # What motions of the views absorb is subtracted from Σ w g gᵀ. Their iteration ended a small step short of where
+    # they agree best: the same step is taken off Σ w g e.
+    M = sums.square.sum(axis=0) - np.einsum("pik,pil->kl", sums.vector, of_view[v] - of_view[w])
     step = visible_step(g)
-    pull = sums.residual.sum(axis=0) + np.einsum("pik,pi->k", sums.vector, step[v] - step[w])
+    vector = sums.residual.sum(axis=0) + np.einsum("pik,pi->k", sums.vector, step[v] - step[w])
     units = np.eye(twists.shape[1] - nuisance)
-    causes = (units[:, :-1], units[:, -1:])
-    return _likelihood_of(sums.square.sum(axis=0) - followed, pull, causes, g, noise, nuisance)
+    return _likelihood_of(M, vector, (units[:, :-1], units[:, -1:]), g, noise, nuisance)
 
 
 def view_error_likelihood(
@@ -387,23 +390,25 @@ def view_error_likelihood(
     g = unconstrained.overlaps.gram
     part = part_of_view(g.views)
     parts = int(part[-1]) + 1
-    # Parameters are COARSE of each part, then those that all share. `at` says which of them a column of a pair is.
+    # The parameters are COARSE shapes of each part, then those that all views share. Per pair (P, columns), `parameter`
+    # says which of them each column of its sums stands for.
     of_parts = [COARSE * part[view][:, None] + np.arange(COARSE) for view in g.pairs.astype(np.int64).T]
     common = COARSE * parts + np.arange(sums.residual.shape[1] - 2 * COARSE)
-    at = np.hstack([*of_parts, np.broadcast_to(common, (len(g.pairs), len(common)))])
-    width = int(at.max()) + 1
-    square, pull = np.zeros((width, width)), np.zeros(width)
-    np.add.at(square, (at[:, :, None], at[:, None, :]), sums.square)
-    np.add.at(pull, at, sums.residual)
-    push = [_sum_on_views(sums, g, at, keep, width) for keep in (~g.labelled, g.labelled)]
-    both = push[0] + push[1]
-    square -= both.T @ solve_view_sums(g, *push)
+    parameter = np.hstack([*of_parts, np.broadcast_to(common, (len(g.pairs), len(common)))])
+    count = int(parameter.max()) + 1
+    M, vector = np.zeros((count, count)), np.zeros(count)
+    np.add.at(M, (parameter[:, :, None], parameter[:, None, :]), sums.square)
+    np.add.at(vector, parameter, sums.residual)
+    # Less what motions of the views can absorb.
+    by_surfaces, by_targets = (_sum_on_views(sums, g, parameter, keep, count) for keep in (~g.labelled, g.labelled))
+    on_views = by_surfaces + by_targets
+    M -= on_views.T @ solve_view_sums(g, by_surfaces, by_targets)
     # The iteration ended a small step short of where the views agree best.
-    pull += both.T @ visible_step(g).ravel()
+    vector += on_views.T @ visible_step(g).ravel()
     # Which parameters an error of each cause changes: a shared coarse shape is the same coefficient in every part.
-    each, incidence, shared = np.split(np.eye(width - nuisance), [COARSE * parts, COARSE * parts + 1], axis=1)
-    causes = (np.hstack([each @ np.tile(np.eye(COARSE), (parts, 1)), shared]), incidence, each)
-    return _likelihood_of(square, pull, causes, g, noise, nuisance, threshold=_NORMAL_NOISE)
+    per_part, incidence, shared = np.split(np.eye(count - nuisance), [COARSE * parts, COARSE * parts + 1], axis=1)
+    causes = (np.hstack([per_part @ np.tile(np.eye(COARSE), (parts, 1)), shared]), incidence, per_part)
+    return _likelihood_of(M, vector, causes, g, noise, nuisance, threshold=_NORMAL_NOISE)
 
 
 def part_of_view(views: int) -> Indices:
@@ -411,20 +416,20 @@ def part_of_view(views: int) -> Indices:
     return np.arange(views) * min(views, _MAX_PARTS) // views
 
 
-def _sum_on_views(sums: PointGram, g: Gram, at: Indices, keep: Mask, width: int) -> Array:
-    """Return Σ w Bᵀg (6V, width), summed over pairs on their views: positive on the first view, negative on the second.
+def _sum_on_views(sums: PointGram, g: Gram, parameter: Indices, keep: Mask, count: int) -> Array:
+    """Return Σ w Bᵀg (6V, count), summed over pairs on their views: positive on the first view, negative on the second.
 
     Args:
-        at: (P, columns) the parameter that each column of the sums of a pair stands for.
-        keep: (P,) bool, the pairs that count.
-        width: number of parameters.
+        parameter: (P, columns) the parameter that each column of the sums of a pair stands for.
+        keep: (P,) mask of the pairs that count.
+        count: number of parameters.
     """
-    out = np.zeros((g.views, width, 6))
+    on_views = np.zeros((g.views, count, 6))
     v, w = g.pairs[keep].astype(np.int64).T
     vectors = np.moveaxis(sums.vector[keep], 1, 2)
-    np.add.at(out, (v[:, None], at[keep]), vectors)
-    np.subtract.at(out, (w[:, None], at[keep]), vectors)
-    return np.moveaxis(out, 1, 2).reshape(6 * g.views, width)
+    np.add.at(on_views, (v[:, None], parameter[keep]), vectors)
+    np.subtract.at(on_views, (w[:, None], parameter[keep]), vectors)
+    return np.moveaxis(on_views, 1, 2).reshape(6 * g.views, count)
 
 
 def _likelihood_of(
@@ -453,11 +458,11 @@ def _likelihood_of(
     if nuisance:
         # The Schur complement: what the nuisance parameters cannot explain.
         K = len(M) - nuisance
-        taken = M[:K, K:] @ np.linalg.pinv(M[K:, K:], rcond=_ROUNDING_SHARE, hermitian=True)
-        M, vector = M[:K, :K] - taken @ M[K:, :K], vector[:K] - taken @ vector[K:]
+        explained = M[:K, K:] @ np.linalg.pinv(M[K:, K:], rcond=_ROUNDING_SHARE, hermitian=True)
+        M, vector = M[:K, :K] - explained @ M[K:, :K], vector[:K] - explained @ vector[K:]
     values, vectors = np.linalg.eigh(M)
     keep = values > threshold * values[-1]
     values, vectors = values[keep], vectors[:, keep]
-    moved = noise * values[:, None] * vectors.T
+    per_parameter = noise * values[:, None] * vectors.T
     scatter = _CORRELATION_FACTOR * g.variance * values
-    return SmoothErrorLikelihood(vectors.T @ vector, tuple(moved @ cause for cause in causes), scatter)
+    return SmoothErrorLikelihood(vectors.T @ vector, tuple(per_parameter @ cause for cause in causes), scatter)
