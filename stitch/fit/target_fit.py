@@ -75,6 +75,8 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
     kept = kept_root(step.model.terms, sessions[0].model.effects_covariance)
     shift = equations.shift_by_errors(step.linearised.columns @ kept)
     covariance = step.solution.covariance * inflation + shift @ shift.T
+    final_sessions = _with_covariances(step, covariance, kept)
+    places = zip(step.linearised.unknowns_of, step.linearised.blocks_of, strict=True)
     return [
         TargetModelFit(
             model=final.model,
@@ -86,13 +88,7 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
             heldout=_heldout_distances(before.rows, equations, blocks),
             history=(*history, _rms_of_sessions([final])),
         )
-        for before, final, unknowns, blocks in zip(
-            step.linearised.sessions,
-            _with_covariances(step, covariance, kept),
-            step.linearised.unknowns_of,
-            step.linearised.blocks_of,
-            strict=True,
-        )
+        for before, final, (unknowns, blocks) in zip(step.linearised.sessions, final_sessions, places, strict=True)
     ]
 
 

@@ -277,11 +277,7 @@ def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
 
 
 def covariance_of_fit(
-    terms: Sequence[Term],
-    fitted: Mask,
-    fitted_covariance: Array,
-    kept_root: Array,
-    with_hand_eye: Array | None = None,
+    terms: Sequence[Term], fitted: Mask, of_fitted: Array, kept_root: Array, with_hand_eye: Array | None = None
 ) -> EffectsCovariance:
     """Return the covariance of the P parameters of effects: of those fitted, and of those kept from another run.
 
@@ -289,14 +285,14 @@ def covariance_of_fit(
 
     Args:
         fitted: (P,) mask of the K parameters that were fitted.
-        fitted_covariance: (K, K) of these.
+        of_fitted: (K, K) covariance of these.
         kept_root: (P, L) root of the covariance of those kept, as `kept_root` returns it; zero rows for the others.
         with_hand_eye: (6, 6 + K) covariance of the hand-eye's twist ξ, T_mount·exp(ξ), with itself and with those
             fitted; stored only with terms of tier geometry, whose places depend on both. None: it is not known.
     """
     names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
     covariance = kept_root @ kept_root.T
-    covariance[np.ix_(fitted, fitted)] += fitted_covariance
+    covariance[np.ix_(fitted, fitted)] += of_fitted
     present = np.diag(covariance) > 0
     names_present = tuple(name for name, is_present in zip(names, present, strict=True) if is_present)
     of_effects = EffectsCovariance(names_present, covariance[np.ix_(present, present)])

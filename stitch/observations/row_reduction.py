@@ -151,16 +151,9 @@ def reduction_of(
     noise_rows = noise_rows - beyond.T @ (beyond @ noise_rows)
     placed = np.linalg.matrix_rank(information, hermitian=True) if eliminated.size else 0
     count = int((noise[:V] > 0).sum() - of_views.any(axis=2).sum() - placed - len(beyond))
-    return RowReduction(
-        per_sigma=per_sigma,
-        of_views=of_views,
-        beyond=beyond,
-        known=known > 0,
-        noise_only=(count, float(noise_rows @ noise_rows) if count else 0.0),
-        points=points,
-        kept=kept,
-        shares=directions[:rank] * length,
-    )
+    noise_only = (count, float(noise_rows @ noise_rows) if count else 0.0)
+    shares = directions[:rank] * length
+    return RowReduction(per_sigma, of_views, beyond, known > 0, noise_only, points, kept, shares)
 
 
 def by_view(of_views: Array) -> csr_array:
