@@ -16,7 +16,7 @@ from stitch.diagnosis import naming
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence, pair_is_validated
 from stitch.diagnosis.naming import find_missing_pair
-from stitch.diagnosis.ranking import Ranked, is_certain, rank_all
+from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, is_certain, rank_all, rank_one
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.validation import CrossValidation
 from stitch.diagnosis.verdict import Evidence
@@ -73,7 +73,7 @@ USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, s
 
 
 def ranked(name, beside=None, adjusted=1e-6):
-    of = SimpleNamespace(name=name, empirical=False)
+    of = SimpleNamespace(name=name, empirical=False, effect=SimpleNamespace(prior=1.0))
     seen = {
         "observable": True,
         "values": (),
@@ -291,9 +291,32 @@ def test_two_effects_are_found_beside_each_other_and_hold(cell):
     assert found["b5"] == pytest.approx(-4e-4, rel=0.3)
 
 
+def test_a_pair_is_refused_where_one_of_the_two_does_not_help_on_views_left_out(cell):
+    linear, candidates, best = best_of(cell, play=6e-4, drift=0.0)
+    beside = conditioned_on_effects(linear, [best])
+    idle = rank_one(beside, next(c for c in candidates if c.name == "fixture_drift"), len(candidates))
+    assert best.name == "backlash" and not any(pair_is_validated(linear, pair) for pair in ((best, idle), (idle, best)))
+
+
 @pytest.mark.parametrize(("play", "drift"), [(6e-4, 0.0), (0.0, 0.05)])
 def test_no_second_effect_is_found_beside_one_that_is_alone(cell, play, drift):
     assert find_missing_pair(*best_of(cell, play=play, drift=drift)) is None
+
+
+@pytest.mark.parametrize(
+    ("pair", "verdict", "named"), [((FIRST, SECOND), "missing_effect", (FIRST,)), (None, "cannot_tell", (FIRST, SECOND))]
+)
+def test_of_few_views_effects_that_come_near_each_other_are_a_group_unless_both_are_missing(
+    monkeypatch, pair, verdict, named
+):
+    monkeypatch.setattr(naming, "regime_of", lambda linear: SimpleNamespace(many_views=False))
+    monkeypatch.setattr(naming, "find_missing_pair", lambda *asked: pair)
+    monkeypatch.setattr(naming, "conditioned_on_effects", lambda linear, chosen: linear)
+    monkeypatch.setattr(naming, "rank_laws", lambda linear, dictionary: ())
+    case = naming.Case(None, (), SimpleNamespace(without=lambda *asked: ()))
+    asked = naming.NAMING[naming.NAMING.index(naming.which_come_near) :]
+    found = naming.ask(asked, case, replace(ALONE, contenders=(FIRST, SECOND)))
+    assert (found.verdict, found.named, found.second) == (verdict, named, SECOND if pair else None)
 
 
 VIEWS, TURNS = 48, 30

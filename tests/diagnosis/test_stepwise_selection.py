@@ -17,7 +17,7 @@ from stitch.diagnosis import stepwise_selection
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.ranking import Ranked, is_certain, rank_one
-from stitch.diagnosis.stepwise_selection import exchanged_set, find_exchange, is_better_set
+from stitch.diagnosis.stepwise_selection import exchanged_set, find_exchange, forward_selection, is_better_set
 from stitch.diagnosis.thresholds import MAX_REMAINING_SHARE
 from stitch.diagnosis.together import decide_together, together_document, together_sentence
 from stitch.diagnosis.validation import CrossValidation, Extrapolation, extrapolate, untested_ends_reason
@@ -29,6 +29,7 @@ from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 
 LOADS = (1.0, 6.0)
+JUMP = np.array([3e-4, -2e-4, 4e-4, 0.15, 0.1, -0.2])  # rad, mm
 
 
 def leaving(poses: float, sigma: float = 1e-3) -> CrossValidation:
@@ -111,6 +112,17 @@ def test_an_imitation_gives_way_to_what_is_there(arm):
 def test_effects_that_are_there_stay(arm):
     linear, candidates, alone = arm
     assert exchanged_set(linear, candidates, [alone[name] for name in TRUE]) == []
+
+
+@pytest.mark.parametrize("first", ["joint_offset", "part_slip"])
+def test_a_jump_in_time_is_found_beside_an_effect_that_lasts(first):
+    moved = np.outer(np.arange(100) >= 60, JUMP)
+    session, T_mount, _ = labelled_cell(2, views=100, offset=1e-3, errors=(np.zeros((100, 6)), moved))
+    linear = target_model(measurement_of(session, prepare_capture(session)), Model(T_mount), None)
+    candidates = [candidate_of(linear, EFFECTS[name]) for name in ("joint_offset", "part_slip", "backlash")]
+    best = rank_one(linear, next(c for c in candidates if c.name == first), len(candidates))
+    found = forward_selection(linear, candidates, best)
+    assert {r.name for r in found.effects} == {"joint_offset", "part_slip"}
 
 
 def stands(session, name):
