@@ -41,11 +41,11 @@ from stitch.session.capture import build_capture
 from stitch.session.measurement import Measurement, ScanView, Views
 
 # Dots along one trend: more cannot be told apart.
-_MOST = 300
+_MOST_DOTS = 300
 # Bins of the points of effects of the scanner and of the part's shape.
 _BINS = 16
-# Correspondences that are asked for one trend.
-_ASKED = 60_000
+# Correspondences at the most that one trend takes.
+_MOST_CORRESPONDENCES = 60_000
 _TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
 # What effects of points live on, with its unit, None for the session's; all others the angle in the field.
 _POINT_AXES = {
@@ -67,67 +67,67 @@ _CONSTANT = Effect(
     "empirical",
 )
 
-# What an effect lives on, its unit, and where the views stand along it (V,).
+# The horizontal axis of a trend: what it shows in words, its unit, and the views' values (V,) along it.
 _Axis = tuple[str, str, Array]
 
 
 @dataclass(frozen=True)
 class EffectTrend:
-    """The trend of one effect over what is drawn of it; lengths in length_unit, angles in rad."""
+    """D dots, each what the model leaves of a view, with the line of one effect over them."""
 
-    follows: str  # what is drawn along: view order, time_s, angle of joint 2, …
+    follows: str  # the horizontal axis: view order, time_s, angle of joint 2, …
     unit: str  # of `at`: "", s, °, N m, °C, length_unit
-    of: str  # what is off: the part, the mount, joint 2, …
-    value_unit: str  # of measured, sigma and predicted: rad, or length_unit
-    at: Array  # (D,)
+    of: str  # what is off by the vertical axis: the part, the mount, joint 2, …
+    value_unit: str  # of the vertical axis: rad, or length_unit
+    at: Array  # (D,) horizontal
     views: Indices  # (D,) number of the view of each dot; empty where dots are bins of points
-    measured: Array  # (D,) with no candidate in the model
+    measured: Array  # (D,) vertical, with no candidate in the model
     sigma: Array  # (D,) standard deviation of a dot, by what is independent between views
-    predicted: Array  # (D,) by how much the effect moves what the model predicts
-    predicted_sigma: Array  # (D,) standard deviation of that
-    moves: str  # what the effect itself moves: `of` where the plot is its own
-    effect: Array  # (D,) what it does there itself, whatever hand-eye and effects in use take of it
+    predicted: Array  # (D,) the line: by how much the effect moves what the model predicts
+    predicted_sigma: Array  # (D,) standard deviation of the line
+    moves: str  # what the effect itself moves: `of`, unless another effect chose the axes
+    effect: Array  # (D,) what it does there itself, before hand-eye and effects in use adapt to it
     after: Array | None = None  # (D,) the dots with the effect in the model, where it is in it
 
-    def only(self, dots: Indices) -> "EffectTrend":
-        """Return the trend with some of its dots."""
+    def with_dots(self, dots: Indices) -> "EffectTrend":
+        """Return the trend with some of its dots, by their indices."""
         names = ("at", "views", "measured", "sigma", "predicted", "predicted_sigma", "effect", "after")
         kept = {name: getattr(self, name) for name in names}
         return replace(self, **{name: values[dots] for name, values in kept.items() if values is not None})
 
 
 def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
-    """Return the trends of the candidates that can be fitted, by name; all are drawn over the dots of the first one.
+    """Return the trends of candidates, by name: one set of dots, whose axes the first candidate chooses, a line each.
 
-    Empty where nothing can be fitted or drawn.
+    Candidates that cannot be fitted are left out. Empty where nothing can be fitted or drawn.
     """
     # Poses scatter independently here, as for the field of the part, so that both pictures predict the same.
     fitted = linear.restricted(())
-    asked = [scored for scored in scores if scored.fitted]
-    anew = [scored if fitted is linear else score(fitted, scored.candidate) for scored in asked]
-    pairs = [(first, again) for first, again in zip(asked, anew, strict=True) if again.fitted]
+    given = [scored for scored in scores if scored.fitted]
+    refitted = [scored if fitted is linear else score(fitted, scored.candidate) for scored in given]
+    pairs = [(scored, again) for scored, again in zip(given, refitted, strict=True) if again.fitted]
     if not pairs:
         return {}
     effects = [_fit_effect(fitted, again) for _, again in pairs]
     if moves_points([effects[0].term]):
         return _trends_of_points(fitted, effects, [again for _, again in pairs])
-    plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_direction(fitted, effects[0]))
-    return {} if plot is None else {effect.term.name: _trend_on(plot, effect) for effect in effects}
+    plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_axes(fitted, effects[0]))
+    return {} if plot is None else {effect.term.name: _trend_in_plot(plot, effect) for effect in effects}
 
 
 @dataclass(frozen=True)
 class ExpectedView:
-    """What rivals expect of one further view along what is drawn; units as in their trends."""
+    """Where rival effects expect the dot of one further view; units as in their trends."""
 
-    at: float
+    at: float  # horizontal
     sigma: float  # by which the dot of one view scatters
-    expected: dict[str, tuple[float, float]]  # effect: value and the standard deviation of what would be seen
+    expected: dict[str, tuple[float, float]]  # by effect: vertical, and the standard deviation of what would be seen
 
 
 def expected_in_view(
     linear: LinearModel, rivals: Sequence[Score], joints: Array, wait: float = 0.0
 ) -> ExpectedView | None:
-    """Return what rival effects predict for the dot of one further view.
+    """Return where each of several rival effects predicts the dot of one further view, in their common plot.
 
     None where that cannot be computed: for labelled points, effects that change points, and dots drawn along gravity.
 
@@ -142,7 +142,7 @@ def expected_in_view(
     if surfaces is None or not anew.fitted or moves_points([scored.form.term for scored in rivals]):
         return None
     effect = _fit_effect(fitted, anew)
-    motion, (follows, _, _) = _direction(fitted, effect)
+    motion, (follows, _, _) = _axes(fitted, effect)
     if "gravity" in follows:
         return None
     measurement = candidate_measurement(linear.measurement, joints[None], wait)
@@ -151,18 +151,20 @@ def expected_in_view(
         at = float(measurement.views.time[0])
     elif follows == "view order":
         at = float(linear.measurement.views.count)
-    # Twists count as displacements: rotations (rad) times the part's reach. `along` projects a twist on the direction.
-    rim = np.repeat([surfaces.reach, 1.0], 3)
-    unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * rim
-    along = unit * rim / max(float(unit @ unit), 1e-300)
+    # Twists count as displacements: rotations (rad) times the part's reach. `projection` is the row that takes a twist
+    # to its multiple of the unit motion.
+    to_displacement = np.repeat([surfaces.reach, 1.0], 3)
+    unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * to_displacement
+    projection = unit * to_displacement / max(float(unit @ unit), 1e-300)
     # A dot is what the model without any candidate leaves: its prediction is subtracted from the rivals'.
     without = fitted.baseline_trial.solve()
     expected = {}
     for scored, prediction in zip(rivals, predict_views(linear, rivals, joints[None], np.array([wait])), strict=True):
         mean, covariance = prediction.of([], np.zeros(1, np.int64))
-        value = along @ (mean[0] - prediction.design[0] @ without)
-        expected[scored.name] = (float(value), float(np.sqrt(along @ covariance[0] @ along)))
-    return ExpectedView(at, float(np.sqrt(along @ _view_scatter(linear, rivals[0], measurement) @ along)), expected)
+        value = projection @ (mean[0] - prediction.design[0] @ without)
+        expected[scored.name] = (float(value), float(np.sqrt(projection @ covariance[0] @ projection)))
+    scatter = _view_scatter(linear, rivals[0], measurement)
+    return ExpectedView(at, float(np.sqrt(projection @ scatter @ projection)), expected)
 
 
 def _view_scatter(linear: LinearModel, scored: Score, measurement: Measurement) -> Array:
@@ -184,19 +186,20 @@ def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement
     """
     bare = Model(linear.model.T_mount)
     if motion.joint is not None:
-        return next(pose_derivatives(measurement, bare, [_zero(linear, EFFECTS["joint_offset"])], centre))[
-            motion.joint, 0
-        ]
+        offset = _term_at_zero(linear, EFFECTS["joint_offset"])
+        return next(pose_derivatives(measurement, bare, [offset], centre))[motion.joint, 0]
     if motion.twist is not None:
-        return motion.twist @ next(pose_derivatives(measurement, bare, [_zero(linear, _CONSTANT)], centre))[:, 0]
-    return np.append(np.zeros(3), motion.columns[0, -3:])
+        return (
+            motion.twist @ next(pose_derivatives(measurement, bare, [_term_at_zero(linear, _CONSTANT)], centre))[:, 0]
+        )
+    return np.append(np.zeros(3), motion.per_unit[0, -3:])
 
 
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     """Return the trend of an effect that is in the model: dots as if it were not, its line, and the dots with it.
 
-    What the effect explains is added to the observations again, and its columns are taken out of the design. None for
-    an effect that changes points, or of which nothing was fitted.
+    For that the effect is taken out of the model again: its share is added to the observations, and its columns leave
+    the design. None for an effect that changes points, or of which nothing was fitted.
     """
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
@@ -204,19 +207,18 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     form = candidate_as_fitted(fitted, term).forms[0]
     norms = np.linalg.norm(fitted.design, axis=0)
     # All columns of the effect, also of parameters that the fit holds at zero: they are found in the design by value.
-    own = fitted.responses([term])[0].columns
-    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], own, 1e-6 * norms[j])]
+    of_effect = fitted.responses([term])[0].columns
+    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], of_effect, 1e-6 * norms[j])]
     # Observations are residuals from the model, which has the effect: its share is added back.
-    seen = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
-    without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=seen))
+    observed = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
+    without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=observed))
     effect = _Effect(term, form, _change(without, form.columns, without))
-    direction = _direction(without, _clearest_joint(effect))
-    plot = _plot(without, linear, *direction)
-    columns = np.hstack([without.design, form.response])
-    beside = _plot(replace(fitted, design=columns), linear, *direction)
-    if plot is None or beside is None:
+    axes = _axes(without, _clearest_joint(effect))
+    plot = _plot(without, linear, *axes)
+    with_effect = _plot(replace(fitted, design=np.hstack([without.design, form.response])), linear, *axes)
+    if plot is None or with_effect is None:
         return None
-    return _trend_on(replace(plot, after=beside.measured), effect)
+    return _trend_in_plot(replace(plot, after=with_effect.measured), effect)
 
 
 def _clearest_joint(effect: "_Effect") -> "_Effect":
@@ -225,35 +227,36 @@ def _clearest_joint(effect: "_Effect") -> "_Effect":
     The measure is vᵀ C⁻¹ v, with values v of that joint's free parameters and their covariance C.
     """
     term, change = effect.term, effect.change
-    # From the index of a parameter to that among the free ones.
-    place = np.cumsum(effect.form.keep) - 1
-    joints = [[i for i in joint if effect.form.keep[i]] for joint in by_joint(term.effect, term.parameters)]
-    joints = [joint for joint in joints if joint]
+    free = np.flatnonzero(effect.form.keep)
+    # Masks over the free parameters, one for each joint that has any.
+    joints = [np.isin(free, joint) for joint in by_joint(term.effect, term.parameters)]
+    joints = [joint for joint in joints if joint.any()]
     if not joints:
         return effect
-
-    def squared_sigmas(joint: list[int]) -> float:
-        at = place[joint]
-        return float(change.values[at] @ np.linalg.pinv(change.covariance[np.ix_(at, at)]) @ change.values[at])
-
-    clearest = max(joints, key=squared_sigmas)
-    alone = np.where(np.isin(np.arange(len(term.values)), clearest) | term.gridded, term.values, 0.0)
-    values = np.where(np.isin(np.flatnonzero(effect.form.keep), clearest), change.values, 0.0)
+    squares = [
+        change.values[joint] @ np.linalg.pinv(change.covariance[np.ix_(joint, joint)]) @ change.values[joint]
+        for joint in joints
+    ]
+    clearest = joints[int(np.argmax(squares))]
+    of_joint = np.isin(np.arange(len(term.values)), free[clearest])
+    alone = np.where(of_joint | term.gridded, term.values, 0.0)
+    values = np.where(clearest, change.values, 0.0)
     return replace(effect, term=term.at(alone), change=replace(change, values=values))
 
 
 def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
+    """Return whether a column (n,) is within a distance of one of several columns (n, p)."""
     return bool((np.linalg.norm(columns - column[:, None], axis=0) <= tolerance).any())
 
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
-    """Return the trend of a joint whose error follows its angle, time or another quantity by no known law."""
+    """Return the trend of a joint whose error follows one covariate by no known law; None if it moves no view."""
     error = np.interp(curve.view_values, curve.at, curve.error)
     return _trend_of_joint(linear, linear, curve.joint, error, (*_axis_words(curve.covariate), curve.view_values))
 
 
 def trend_of_law(linear: LinearModel, ranked: Ranked) -> EffectTrend | None:
-    """Return the trend of a joint that follows a quantity by a law of the dictionary; None for a law elsewhere."""
+    """Return the trend of a joint that errs by a law of the dictionary; None for a law of something else."""
     law, scored = law_of(ranked), ranked.score
     if law.place.joint is None:
         return None
@@ -264,7 +267,7 @@ def trend_of_law(linear: LinearModel, ranked: Ranked) -> EffectTrend | None:
 
 
 def _axis_words(covariate: str) -> tuple[str, str]:
-    """Return what a covariate is called along an axis, and its unit where it stands beside."""
+    """Return the title of a covariate's axis and its unit; "" where the title contains it or there is none."""
     if covariate == "time_s":
         return "time", "s"
     angle = re.fullmatch(r"j(\d+)_deg", covariate)
@@ -280,22 +283,22 @@ def _trend_of_joint(
         scatter: the model with the variances of what is independent between views.
         number: of the joint, counted from 1.
         error: (V,) rad, the shape of the error; its size and a constant are fitted.
-        axis: what the trend is drawn over.
+        axis: horizontal axis of the trend.
     """
     fitted = linear.restricted(())
     turned = _joint_columns(fitted)[:, number - 1 : number]
     # With a constant, since the zero of the joint is not known either.
     shapes = np.column_stack([error, np.ones_like(error)])
-    response = turned * _of_rows(fitted, shapes, len(turned))
-    columns = _displacements(fitted, turned)[..., 0]
-    motion = _Motion(f"joint {number}", "rad", columns, error[:, None] * columns, number - 1)
+    response = turned * _repeat_for_rows(fitted, shapes, len(turned))
+    per_unit = _displacements(fitted, turned)[..., 0]
+    motion = _Motion(f"joint {number}", "rad", per_unit, error[:, None] * per_unit, number - 1)
     plot = _plot(fitted, scatter, motion, axis)
     change = _change(fitted, fitted.reduce(response), fitted)
     return None if plot is None else plot.trend(change, motion.of, shapes @ change.values)
 
 
 def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:
-    """Return the trend of the views' displacement along the covariate that it depends on; the line joins means of bins.
+    """Return the views' displacements over the covariate that they depend on, with a line through the means of bins.
 
     The standard deviation of a dot is that of all dots about the line.
     """
@@ -315,37 +318,37 @@ def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTr
         moves="the views",
         effect=predicted,
     )
-    return trend.only(_shown(len(predicted)))
+    return trend.with_dots(_drawn_views(len(predicted)))
 
 
-def _shown(views: int) -> Indices:
-    """Return the numbers of the views that are shown."""
-    return np.unique(np.linspace(0, views - 1, min(views, _MOST)).astype(np.int64))
+def _drawn_views(views: int) -> Indices:
+    """Return the indices of the views that get a dot: at most `_MOST_DOTS`, evenly chosen."""
+    return np.unique(np.linspace(0, views - 1, min(views, _MOST_DOTS)).astype(np.int64))
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """What is off, and how a unit of that displaces each view."""
+    """The vertical axis of a plot: what is off, and how one unit of that displaces each view (`_displacements`)."""
 
-    of: str
+    of: str  # the part, joint 2, …
     unit: str
-    columns: Array  # (V, k) displacements
-    response: Array  # (V, k) displacements by the effect
-    joint: int | None = None  # counted from 0
+    per_unit: Array  # (V, k) displacements by a unit of the motion
+    by_effect: Array  # (V, k) displacements by the effect that chose the motion
+    joint: int | None = None  # that turns, counted from 0
     twist: Array | None = None  # (6,) of the mount, a unit
 
     @property
-    def line(self) -> Array:
-        """(V,) displacement by the effect along that of a unit, times the latter."""
-        return np.sum(self.columns * self.response, axis=1)
+    def products(self) -> Array:
+        """(V,) inner products of the effect's displacement with that of a unit."""
+        return np.sum(self.per_unit * self.by_effect, axis=1)
 
 
 @dataclass(frozen=True)
 class _Change:
-    """What an effect changes in what the model predicts of the reduced observations."""
+    """What an effect changes in the model's prediction of the reduced observations."""
 
     per_unit: Array  # (n, p) per unit of each parameter, hand-eye and effects in use fitted anew beside it
-    values: Array  # (p,)
+    values: Array  # (p,) of the parameters
     covariance: Array  # (p, p)
 
 
@@ -357,7 +360,7 @@ def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change
         beside: the model with the variances that remain beside these columns, for the covariance.
     """
     white = linear.whiten(columns)
-    # What hand-eye and effects in use take up of each column, in units of their parameters.
+    # How hand-eye and effects in use change by a unit of each column: they absorb a part of it.
     absorbed = np.column_stack([fit_columns(linear.white_design, column) for column in white.T]).astype(float)
     residual = beside.residual(columns)
     values = fit_columns(linear.residual(columns), linear.white_residual)
@@ -375,57 +378,60 @@ class _Effect:
 
 
 def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
-    """Return the best form of a score fitted to a linear model, at the variances of the score if it has any."""
+    """Return the best form of a scored effect, fitted to a linear model; its covariance is at the score's variances."""
     beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
     change = _change(linear, scored.form.columns, beside)
     return _Effect(scored.form.at(change.values), scored.form, change)
 
 
-def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
-    """Return the motion along which an effect is drawn, and the axis over which.
+def _axes(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
+    """Return the vertical axis of an effect's plot, a motion, and the horizontal one.
 
     The sign is chosen so that the largest displacement is positive; the turn of a joint keeps its own sign.
     """
     motion = _motion(linear, effect)
-    line = motion.line
-    if motion.joint is None and line[np.argmax(np.abs(line))] < 0:
-        turned = None if motion.twist is None else -motion.twist
-        motion = replace(motion, columns=-motion.columns, twist=turned)
+    products = motion.products
+    if motion.joint is None and products[np.argmax(np.abs(products))] < 0:
+        reversed_twist = None if motion.twist is None else -motion.twist
+        motion = replace(motion, per_unit=-motion.per_unit, twist=reversed_twist)
     return motion, _axis(linear.measurement.views, effect.term, motion)
 
 
-def _trend_on(plot: "_Plot", effect: _Effect) -> EffectTrend:
-    """Return the trend of an effect over the dots of a plot, which another effect may have chosen."""
+def _trend_in_plot(plot: "_Plot", effect: _Effect) -> EffectTrend:
+    """Return the trend of an effect over the dots of a plot whose axes another effect may have chosen."""
     motion = _motion(plot.linear, effect)
-    square = np.sum(motion.columns**2, axis=1)
-    line = motion.line / np.maximum(square, 1e-2 * np.median(square))
+    square = np.sum(motion.per_unit**2, axis=1)
+    amount = motion.products / np.maximum(square, 1e-2 * np.median(square))
     if effect.term.effect.place == "part":
         # Where the part sat at first is nobody's error.
-        line = line - line[np.argmin(plot.axis[2])]
-    return plot.trend(effect.change, motion.of, line)
+        amount = amount - amount[np.argmin(plot.axis[2])]
+    return plot.trend(effect.change, motion.of, amount)
 
 
 @dataclass(frozen=True)
 class _Plot:
-    """Dots along one direction, for every candidate."""
+    """The dots of all views, between a horizontal and a vertical axis; lines of candidates are drawn over them."""
 
-    linear: LinearModel  # without any
-    motion: _Motion
-    axis: _Axis
-    measured: Array  # (V,)
+    linear: LinearModel  # without any candidate
+    motion: _Motion  # vertical axis
+    axis: _Axis  # horizontal axis
+    measured: Array  # (V,) in units of the motion
     sigma: Array  # (V,)
     after: Array | None = None  # (V,) with an effect in the model that the dots are without
 
     @cached_property
-    def square(self) -> Array:
-        """(V,) squared length of a unit motion; where it moves a view by next to nothing, the view says nothing."""
-        square = np.sum(self.motion.columns**2, axis=1)
+    def unit_square(self) -> Array:
+        """(V,) squared displacement by a unit of the motion; not less than 1 % of the median over the views.
+
+        A view that a unit hardly moves would get a dot of noise.
+        """
+        square = np.sum(self.motion.per_unit**2, axis=1)
         return np.maximum(square, 1e-2 * np.median(square))
 
-    def along(self, numbers: Array) -> Array:
-        """Return displacements (V, P) of the views along the direction by reduced observations (n, P), per column."""
-        moved = _displacements(self.linear, self.linear.observation.expand(numbers))
-        return np.einsum("vk,vkp->vp", self.motion.columns, moved) / self.square[:, None]
+    def amounts(self, reduced: Array) -> Array:
+        """Return by how many units of the motion (V, P) reduced observations (n, P) displace the views, per column."""
+        moved = _displacements(self.linear, self.linear.observation.expand(reduced))
+        return np.einsum("vk,vkp->vp", self.motion.per_unit, moved) / self.unit_square[:, None]
 
     def trend(self, change: _Change, moves: str, effect: Array) -> EffectTrend:
         """Return the trend of an effect: the dots, with the line that the model would predict with it, and its sigma.
@@ -433,9 +439,9 @@ class _Plot:
         Args:
             change: of the model's prediction by the effect, per unit of each parameter.
             moves: what the effect itself moves: the part, joint 2, …
-            effect: (V,) by how much, in the unit of the motion, whatever hand-eye and effects in use take of it.
+            effect: (V,) what it does itself in units of the motion, before hand-eye and effects in use adapt to it.
         """
-        per_unit = self.along(change.per_unit)
+        per_unit = self.amounts(change.per_unit)
         follows, unit, at = self.axis
         trend = EffectTrend(
             follows,
@@ -452,7 +458,7 @@ class _Plot:
             effect=effect,
             after=self.after,
         )
-        return trend.only(_shown(len(at)))
+        return trend.with_dots(_drawn_views(len(at)))
 
 
 def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
@@ -461,35 +467,35 @@ def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axi
     Args:
         linear: the model, without any candidate.
         scatter: the model with the variances of what is independent between views.
-        motion: what is off.
-        axis: what the plot is drawn over.
+        motion: vertical axis.
+        axis: horizontal axis.
     """
-    if not motion.columns.any():
+    if not motion.per_unit.any():
         return None
     plot = _Plot(linear, motion, axis, np.zeros(0), np.zeros(0))
     explained = linear.design @ linear.baseline_trial.solve()[-linear.design.shape[1] :]
-    left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
-    # With cov = half halfᵀ, sigma² is the sum over columns of `half`. Columns are those of all blocks side by side:
+    residual = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
+    # With cov = root rootᵀ, sigma² is the sum over columns of `root`. Columns are those of all blocks side by side:
     # an observation moves views of its own block alone, but for the mean of all.
-    half = np.linalg.cholesky(_independent(scatter)).reshape(len(left), -1).astype(float)
-    sigma = np.sqrt(np.sum(plot.along(half) ** 2, axis=1))
-    return replace(plot, measured=plot.along(left[:, None])[:, 0], sigma=sigma)
+    root = np.linalg.cholesky(_independent_covariance(scatter)).reshape(len(residual), -1).astype(float)
+    sigma = np.sqrt(np.sum(plot.amounts(root) ** 2, axis=1))
+    return replace(plot, measured=plot.amounts(residual[:, None])[:, 0], sigma=sigma)
 
 
-def _independent(linear: LinearModel) -> Array:
+def _independent_covariance(linear: LinearModel) -> Array:
     """Return the covariance (B, m, m) of what is independent between views: scatter of flange and joints, and noise.
 
     There are B blocks of m reduced observations. A small multiple of the identity keeps it positive definite.
     """
     names = linear.component_names
-    some = [*range(NOISE + 1), *(NOISE + 1 + k for k, name in enumerate(names) if name == JOINT_SCATTER)]
-    covariance = np.einsum("c,cbij->bij", linear.null.variances[some], linear.mixed.components[some])
+    independent = [*range(NOISE + 1), *(NOISE + 1 + k for k, name in enumerate(names) if name == JOINT_SCATTER)]
+    covariance = np.einsum("c,cbij->bij", linear.null.variances[independent], linear.mixed.components[independent])
     size = np.einsum("bii->b", covariance) / covariance.shape[1]
     return covariance + 1e-12 * size[:, None, None] * np.eye(covariance.shape[1])
 
 
 def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
-    """Return the motion along which an effect is drawn, by the place where it acts.
+    """Return the motion that is the vertical axis of an effect's plot, by the place where the effect acts.
 
     Effects of joints: the turn of the joint that moves the views most. Effects of the mount: its twist in the view that
     moves most, less the mean. All others: the first principal direction of the views' displacements.
@@ -499,48 +505,44 @@ def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
     unit = linear.measurement.length_unit
     if term.effect.place == "robot":
         turned = _joint_columns(linear)
-        errors = _joint_errors(linear.measurement.views, term)
+        views = linear.measurement.views
+        errors = term.effect.function(views.joints, views, **term.arguments) - views.joints
         # Square sums of the reduced observations tell how much each joint is seen to move.
-        reduced = linear.reduce(turned * _of_rows(linear, errors, len(turned)))
+        reduced = linear.reduce(turned * _repeat_for_rows(linear, errors, len(turned)))
         joint = int(np.argmax(np.sum(reduced**2, axis=0)))
-        columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
-        return _Motion(f"joint {joint + 1}", "rad", columns, errors[:, joint : joint + 1] * columns, joint)
+        per_unit = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
+        return _Motion(f"joint {joint + 1}", "rad", per_unit, errors[:, joint : joint + 1] * per_unit, joint)
     if term.effect.place == "mount":
         twists = term.effect.function(linear.measurement.views, **term.arguments)
-        along = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
-        at_constant = linear.responses([_zero(linear, _CONSTANT)])[0].columns
-        columns = _displacements(linear, at_constant @ along[:, None])[..., 0]
-        # Rows of a mean length of one.
-        length = max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
-        return _Motion("the scanner's mount", unit, columns / length, response, twist=along / length)
+        twist = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
+        at_constant = linear.responses([_term_at_zero(linear, _CONSTANT)])[0].columns
+        displacement = _displacements(linear, at_constant @ twist[:, None])[..., 0]
+        # A unit displaces the views by one on average.
+        length = max(float(np.mean(np.linalg.norm(displacement, axis=1))), 1e-300)
+        return _Motion("the scanner's mount", unit, displacement / length, response, twist=twist / length)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
     of = _BODIES.get(term.effect.place, "the arm")
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
 
 
 def _joint_columns(linear: LinearModel) -> Array:
-    """Return (·, n) response to a turn of each joint."""
-    return linear.responses([_zero(linear, EFFECTS["joint_offset"])])[0].columns
+    """Return the response (·, n) of the observation to a turn of each joint, per rad."""
+    return linear.responses([_term_at_zero(linear, EFFECTS["joint_offset"])])[0].columns
 
 
-def _zero(linear: LinearModel, effect: Effect) -> Term:
+def _term_at_zero(linear: LinearModel, effect: Effect) -> Term:
+    """Return an effect with all its parameters in this session at value 0."""
     return Term(effect, parameters_in(linear.measurement, effect))
 
 
-def _joint_errors(views: Views, fitted: Term) -> Array:
-    """Return (V, n) rad by which an effect turns the joints."""
-    errors: Array = fitted.effect.function(views.joints, views, **fitted.arguments) - views.joints
-    return errors
-
-
-def _of_rows(linear: LinearModel, values: Array, count: int) -> Array:
-    """Return (count, P) values of the views (V, P) for every row of a response; zero for rows of no view."""
+def _repeat_for_rows(linear: LinearModel, values: Array, count: int) -> Array:
+    """Return values (V, P) of the views repeated for the `count` rows of a response; zero for rows of no view."""
     rows = np.repeat(values, len(linear.mixed.z[0]) if surfaces_of(linear) is None else 6, axis=0)
     return np.vstack([rows, np.zeros((count - len(rows), values.shape[1]))])
 
 
 def _displacements(linear: LinearModel, response: Array) -> Array:
-    """Return displacements (V, k, P) of the views at the part, length_unit, by responses (·, P), one a parameter.
+    """Return displacements (V, k, P) of the views at the part, length_unit, from responses (·, P) of the observation.
 
     Of surfaces they are twists (k = 6) with rotations times the part's reach; of labelled points, k = 3 translations.
     """
@@ -555,7 +557,7 @@ def _displacements(linear: LinearModel, response: Array) -> Array:
 
 
 def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
-    """Return over what an effect of views is drawn, in words, its unit, and its value (V,) in each view.
+    """Return the horizontal axis of an effect's plot: what it shows, in words, its unit, and its value (V,) per view.
 
     That is what the effect depends on: a joint's quantity, gravity, a covariate or time; else the order of the views.
     """
@@ -564,10 +566,10 @@ def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
         return _joint_axis(views, term, motion.joint)
     for weight in ("gravity_at_mount", "gravity_at_part"):
         if weight in effect.needs:
-            # What gives way under its weight lives on the pull of gravity along the direction that moves it most.
+            # What gives way under its weight follows the pull of gravity along the direction that moves it most.
             gravity = getattr(views, weight)
-            line = motion.line / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
-            slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
+            amount = motion.products / np.maximum(np.sum(motion.per_unit**2, axis=1), 1e-300)
+            slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(amount))]), amount, rcond=1e-6)[0][:3]
             pull = gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
             return "pull of gravity where it gives way most", "g", pull
     covariate = next((name for name in (*effect.prefers, *effect.needs) if name in views.covariates), None)
@@ -580,7 +582,7 @@ def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
 
 
 def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
-    """Return the axis of an effect of one joint: words, unit, and values (V,) of its torque, move, speed or angle.
+    """Return the horizontal axis of an effect of one joint: its torque, last move, speed or angle, by the effect.
 
     Args:
         joint: counted from 0.
@@ -605,12 +607,12 @@ def _trends_of_points(
 ) -> dict[str, EffectTrend]:
     """Return trends of effects that change points, by name: means over bins of points in place of dots of views.
 
-    Dots are the remaining distances divided by the cosine between the first effect's motion and the normal. A line is
-    the part of them that each effect explains. Its sigma is |line| / √W, with the Wald statistic W = vᵀ C⁻¹ v of the
-    effect's values v. Empty without clouds.
+    A dot is the distance that the model leaves in a bin, divided by the cosine between the first effect's motion and
+    the normal. A line is the part of that which an effect explains. Its sigma is |line| / √W, with the Wald statistic
+    W = vᵀ C⁻¹ v of the effect's values v. Empty without clouds.
 
     Args:
-        effects: fitted effects; the first chooses motion and axis.
+        effects: fitted effects; the first chooses both axes.
         scores: of these effects, in the same order.
     """
     surfaces = surfaces_of(linear)
@@ -665,17 +667,19 @@ def _owner(term: Term) -> str:
 
 
 def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, count: int) -> list[Any]:
-    """Return four arrays (N,) on the points of at most `_ASKED` correspondences, those of both views.
+    """Return four arrays (N,) on both points of at most `_MOST_CORRESPONDENCES` correspondences.
 
-    They are: the value of what the effect depends on, the signed cosine between the effect's motion and the normal, the
-    number of the correspondence, and the point's view. The sign is that of the distance, first view less second.
+    1. The value of what the effect depends on.
+    2. The cosine between the effect's motion and the normal, with the sign of the distance: first view less second.
+    3. The number of the correspondence.
+    4. The point's view.
 
     Args:
         count: number of all correspondences.
     """
     poses = surfaces.capture.poses(linear.model.T_mount)
     matches = surfaces.unconstrained.overlaps.matches
-    step = max(count // _ASKED, 1)
+    step = max(count // _MOST_CORRESPONDENCES, 1)
     rows = list[tuple[Any, ...]]()
     start = 0
     for m in matches:
@@ -685,8 +689,9 @@ def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: 
         for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):
             points, view = scan_points(linear.measurement, v, index)
             direction = _directions(term, points, view, poses[v])
-            facing = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
-            rows.append((_place_of(term.name, points, view, poses[v]), sign * facing, number, np.full(len(some), v)))
+            cosine = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
+            at = _driver_values(term.name, points, view, poses[v])
+            rows.append((at, sign * cosine, number, np.full(len(some), v)))
     return [np.concatenate(column) for column in zip(*rows, strict=True)]
 
 
@@ -704,7 +709,7 @@ def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array
     return moved / np.maximum(length, 1e-300)[:, None]
 
 
-def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
+def _driver_values(name: str, points: Array, view: ScanView, pose: Array) -> Array:
     """Return values (N,) of what an effect of points depends on: distance, angle (degrees), height, temperature …
 
     Args:
@@ -730,7 +735,12 @@ def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
 
 
 def _bins(at: Array, cosine: Array) -> list[Mask]:
-    """Return masks (N,) of bins of equal counts of points in which the effect can be seen; [] where all stand alike."""
+    """Return masks (N,) of bins of equal counts of points in which the effect can be seen; [] if all points are alike.
+
+    Args:
+        at: (N,) what the bins divide.
+        cosine: (N,) between the effect's motion and the normal.
+    """
     edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
     inside = [(at >= low) & (at <= high) for low, high in pairwise(edges)]
     return [some for some in inside if np.sum(cosine[some] ** 2) > 0] if len(edges) > 2 else []
@@ -757,8 +767,8 @@ def _scatter(bins: Sequence[Mask], cosine: Array, remaining: Array, view_of: Ind
         view_of: (N,) view of each point.
     """
     sigma = []
-    for b, off in zip(bins, _means(bins, cosine, remaining), strict=True):
-        top = np.bincount(view_of[b], (cosine * remaining)[b])
-        below = np.bincount(view_of[b], cosine[b] ** 2)
-        sigma.append(np.sqrt(np.sum((top - off * below) ** 2)) / below.sum())
+    for b, mean in zip(bins, _means(bins, cosine, remaining), strict=True):
+        products = np.bincount(view_of[b], (cosine * remaining)[b])
+        squares = np.bincount(view_of[b], cosine[b] ** 2)
+        sigma.append(np.sqrt(np.sum((products - mean * squares) ** 2)) / squares.sum())
     return np.array(sigma)

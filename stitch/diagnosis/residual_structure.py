@@ -59,8 +59,8 @@ def variance_budget(
     """Return the sources of the views' pose errors with their shares of the variance, largest first.
 
     Sources are the effects in the model, those named as missing, a trend in time, and the components of what remains.
-    A source's square is that of its reduced observations, without the part that the hand-eye can imitate. () where
-    pose errors have no prior (many views, labelled points).
+    The share of a source is that of its sum of squares in the reduced observations, less what the hand-eye can imitate.
+    () where pose errors have no prior (many views, labelled points).
 
     Args:
         named: candidates that are said to be missing.
@@ -82,10 +82,9 @@ def variance_budget(
     explained |= {scored.name: scored.form.columns @ scored.values for scored in named}
     columns = [scored.form.columns for scored in named]
     if trend is not None:
-        explained["one course of time"] = trend.numbers
+        explained["one course of time"] = trend.explained
         columns.append(trend.columns)
-    # Of what no hand-eye explains.
-    squares = {name: float(np.sum(project_out(hand_eye, numbers[:, None]) ** 2)) for name, numbers in explained.items()}
+    squares = {name: float(np.sum(project_out(hand_eye, part[:, None]) ** 2)) for name, part in explained.items()}
     for name, square in _remaining_squares(linear, columns):
         squares[name] = squares.get(name, 0.0) + square
     total = sum(squares.values())
@@ -98,10 +97,10 @@ def variance_budget(
 
 
 def _remaining_squares(linear: LinearModel, explained: Sequence[Array]) -> list[tuple[str, float]]:
-    """Return (source, sum of squares) of each variance component in what remains beside the model and further columns.
+    """Return pairs (source, expected sum of squares) of the variance components in the residual of a fit.
 
-    For a component of variance σ² and covariance C it is σ² tr((I − U Uᵀ) C), U an orthonormal basis of the columns of
-    the model and of `explained`.
+    For a component of variance σ² and covariance C it is σ² tr((I − U Uᵀ) C), U an orthonormal basis of all that is
+    fitted: the columns of the model and of `explained`.
 
     Args:
         explained: matrices (n, p) of the reduced observations that other sources explain.
@@ -126,9 +125,9 @@ def _remaining_squares(linear: LinearModel, explained: Sequence[Array]) -> list[
 def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingError]) -> bool:
     """Return whether an unnamed error over the scanner's field explains the views best, by 20 to 1.
 
-    It must be the first of the empirical shapes, significant, and 20 to 1 likelier than the next shape and than every
-    repeating error of the poses. Such an error is the same in every view, such as axes of unequal scale: overlaps show
-    it, and joints, mount or time only seem to cause it.
+    It must be the first of the empirical shapes, significant, and 20 to 1 likelier than no error, than the next shape
+    and than every repeating error of the poses. Such an error is the same in every view, such as axes of unequal scale:
+    overlaps show it, and joints, mount or time only seem to cause it.
 
     Args:
         empirical: shapes without a cause, best first.
@@ -146,9 +145,9 @@ def predicted_distances(
 ) -> Array | None:
     """Return signed distances (M,) of all correspondences as predicted with a candidate in the model, length_unit.
 
-    The prediction is linear; hand-eye, effects in use and the candidate are fitted together. Poses scatter
-    independently in this fit, as in that of `add`. The candidate is scored again for it, since another of its forms may
-    fit best there than beside random effects of the arm. None without clouds.
+    Hand-eye, effects in use and the candidate are fitted together in the linear model, with poses that scatter
+    independently, as `add` fits them. The candidate is scored again for that fit: another of its forms may be the best
+    there than beside random effects of the arm. None without clouds.
 
     Args:
         scored: the candidate; None: the model alone.
@@ -170,7 +169,7 @@ def predicted_distances(
         k = scored.form.response.shape[1]
         term = scored.form.at(solution[-k:])
         if moves_points([term]):
-            # Such an effect changes the points, and the views only as hand-eye and the others follow.
+            # The effect itself moves points of a scan; the views move only by the change of hand-eye and other effects.
             twists = X[:, :-k] @ solution[:-k]
             corrections = (scan_correction(fitted.measurement, [term], v, T, slice(None)) for v, T in enumerate(poses))
             points = [p + correction for p, correction in zip(points, corrections, strict=True)]

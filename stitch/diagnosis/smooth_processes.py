@@ -32,19 +32,22 @@ _SIZES = np.geomspace(0.1, 1e5, 49)
 
 @dataclass(frozen=True)
 class SmoothProcess:
-    """Motions of the views that follow trends with unit coefficients; far smaller than its columns."""
+    """Σ c·motion·shape over all p motions and R shapes, with independent coefficients c of variance 1.
+
+    Its columns are far larger than this, and made only where it is fitted.
+    """
 
     joint: int | None  # that errs, counted from 1; None: the flange
-    motions: Array  # (V, 6, p) twists
-    shapes: Array  # (V, R) trends
-    # Of a flange that errs by one shape in time:
+    motions: Array  # (V, 6, p) twists of the views
+    shapes: Array  # (V, R) by which a motion is multiplied in each view
+    # Only of a flange that errs by a swing or a stretch in time:
     kind: str = ""
-    words: str = ""  # what they do: "they …"
+    words: str = ""  # what the poses do: "they …"
     trend: Callable[[Array], Array] | None = None  # times (T,) in steps from view to view → shapes (T, R)
     frequency: float | None = None  # 1/step, of a swing
 
     def columns(self, linear: LinearModel) -> Array:
-        """Return (n, p·R) of the reduced observations: each motion in each trend."""
+        """Return the columns (n, p·R) of the coefficients in the reduced observations, motion by motion."""
         moved = self.motions[:, :, :, None] * self.shapes[:, None, None, :]
         return linear.observation.from_twists(moved.reshape(6 * len(moved), -1))
 
@@ -55,30 +58,31 @@ class FittedProcess:
 
     base: LinearModel  # without it
     process: SmoothProcess
-    columns: Array  # (n, R) of the reduced observations, per unit of that size
-    size: float
+    columns: Array  # (n, R) of its coefficients in the reduced observations
+    size: float  # standard deviation of the coefficients
     fit: VarianceFit  # of the views with the process
     log_bayes_factor: float  # over the model without it, less the number of processes that were tried
 
     @property
     def joint(self) -> int | None:
-        """The joint that follows it, counted from 1; None: the flange, in time."""
+        """The joint that errs by it, counted from 1; None: the flange, in time."""
         return self.process.joint
 
     @property
     def words(self) -> str:
-        """Joint 3 follows a smooth curve without a name; the flange wanders in time."""
-        joint = self.joint and f"joint {self.joint} follows a smooth curve without a name"
-        return joint or "the flange wanders in time"
+        """Which joint errs, or that the flange does, as a clause."""
+        if self.joint is None:
+            return "the flange wanders in time"
+        return f"joint {self.joint} follows a smooth curve without a name"
 
     @property
     def flange_scatter(self) -> Array:
-        """(2,) variances along an axis by which the flange turns and moves anew in every view, beside the process."""
+        """(2,) variances per axis of the scatter of the flange, rad² and length_unit², beside the process."""
         return self.base.flange_scatter(self.fit)
 
     @property
-    def numbers(self) -> Array:
-        """(n,) of the reduced observations that it explains."""
+    def explained(self) -> Array:
+        """(n,) what it explains of the reduced observations, at its likeliest coefficients."""
         return self.columns @ self.fit.mean[-self.columns.shape[1] :]
 
 
@@ -89,7 +93,7 @@ def joint_motions(linear: LinearModel) -> Array:
 
 
 def single_joint_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
-    """Yield processes of one joint: smooth in all joint angles, in its own, or in its own now and in the view before.
+    """Yield three processes of one joint: smooth in all joint angles; in its own; in its own here and one view before.
 
     Args:
         motions: (n, V, 6, 1) twists of the views per radian of each joint.
@@ -121,38 +125,39 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
     time = time_in_steps(measurement)
     knots = _knots(len(time))
     covariance = exponential_kernel(time, time[knots], DRIFT_MEMORY["slowly wandering"])
-    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
-    return SmoothProcess(None, carried, covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS // 6))
+    motions = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
+    return SmoothProcess(None, motions, covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS // 6))
 
 
 def leading_trends(covariance: Array, most: int) -> Array:
-    """Return coefficients (K, R) of the leading trends of a process: covariance with the knots (·, K) times these.
+    """Return the matrix (K, R) that turns covariances (V, K) with K knots into R trends (V, R) of a random process.
 
-    The trends have independent coefficients of unit variance. With eigenvalues d and eigenvectors E of the covariance
-    they are E d^(−½), so that K E d^(−½) has the covariance K at the knots (Nyström's method).
+    A sum of these trends with independent coefficients of variance 1 has nearly the covariance of the process
+    (Nyström's method). With the largest eigenvalues d and eigenvectors E of the covariance C of the knots the matrix is
+    E d^(−½): at the knots the trends C E d^(−½) are E d^(½), whose square is C.
 
     Args:
-        covariance: (K, K) between K knots, chosen views.
-        most: largest number R; small eigenvalues are left out.
+        covariance: (K, K) between the knots, which are some of the views.
+        most: largest number R; small eigenvalues are left out too.
     """
-    # A smooth covariance has low rank: by pivoted Cholesky, root rootᵀ, the eigenproblem is smaller and three times as
-    # fast.
+    # A smooth covariance has low rank. By pivoted Cholesky it is root rootᵀ, and the eigenvectors come from the smaller
+    # rootᵀ root, three times as fast.
     factor, order, rank, _ = dpstrf(covariance, lower=1, tol=_ROUNDING * covariance.diagonal().max())
     root = np.zeros((len(covariance), rank))
     root[order - 1] = np.tril(factor[:, :rank])
-    few = rank < len(covariance) / 2
-    values, vectors = np.linalg.eigh(root.T @ root if few else covariance)
+    low_rank = rank < len(covariance) / 2
+    values, vectors = np.linalg.eigh(root.T @ root if low_rank else covariance)
     values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
     keep = values > limits.PROCESS_LEAST_VARIANCE * values[0]
     trends = vectors[:, keep] / np.sqrt(values[keep])
-    return root @ (trends / np.sqrt(values[keep])) if few else trends
+    return root @ (trends / np.sqrt(values[keep])) if low_rank else trends
 
 
 def size_process(linear: LinearModel, process: SmoothProcess) -> tuple[float, float]:
-    """Return the size that is likeliest at the null's variances, and its log Bayes factor there.
+    """Return the likeliest size of a process at the null's variances, and its log Bayes factor over no process there.
 
-    Over the eigenvalues k of the columns' information and the shares g of what was observed: log BF(s) =
-    ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
+    With size s (of the coefficients), eigenvalues k of the coefficients' information and their score g along the
+    eigenvectors: log BF(s) = ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
     """
     (information,), (vector,) = linear.information_of_motions(process.motions, process.shapes[None])
     k, vectors = np.linalg.eigh(information)
@@ -166,10 +171,10 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> tuple[float, fl
 
 
 def fit_process(linear: LinearModel, process: SmoothProcess, first_size: float, tried: int) -> FittedProcess:
-    """Return a process fitted together with all variances, at the better of two sizes.
+    """Return a process fitted together with all variances, at the likelier of two sizes.
 
-    What the process explains is no scatter. With less scatter another size may be likelier: it is sought once more at
-    the variances of the first fit.
+    What the process explains is no scatter, and with less scatter another size may be likelier: the second size is
+    sought at the variances of the first fit.
 
     Args:
         first_size: the likeliest at the null's variances (`size_process`).
@@ -187,13 +192,20 @@ def fit_process(linear: LinearModel, process: SmoothProcess, first_size: float, 
 
 
 def _smooth_trends(angles: Array, reach: float = REACH) -> Array:
-    """Return (V, R) smooth trends over some angles (V, a), without what is alike in all views: that has a name."""
+    """Return (V, R) trends of a smooth random function of a angles, less their mean over the views.
+
+    The mean, a constant offset, is an effect that has a name.
+
+    Args:
+        angles: (V, a) rad.
+        reach: angle over which the function changes little, rad.
+    """
     return _smooth_trends_of(np.ascontiguousarray(angles).tobytes(), len(angles), reach)
 
 
 @lru_cache(maxsize=_KEPT)
 def _smooth_trends_of(angles: bytes, views: int, reach: float) -> Array:
-    """Return (V, R) of the views whose angles these are: the same in every diagnosis of a session."""
+    """Return the trends of `_smooth_trends`, cached by the bytes of the angles: every diagnosis asks for them."""
     of_views = np.frombuffer(angles).reshape(views, -1)
     knots = _knots(views)
     covariance = rbf_joints(of_views, of_views[knots], reach)
@@ -202,5 +214,5 @@ def _smooth_trends_of(angles: bytes, views: int, reach: float) -> Array:
 
 
 def _knots(views: int) -> Indices:
-    """Return the views whose covariance is drawn apart."""
+    """Return the indices of the views that stand for all in an eigenproblem: at most `PROCESS_KNOTS`, evenly chosen."""
     return np.unique(np.linspace(0, views - 1, min(views, limits.PROCESS_KNOTS)).astype(np.int64))

@@ -85,7 +85,7 @@ CLEAR_DEPENDENCE, DEPENDENCE_BINS = 0.01, 5
 
 # Columns of a process at the most, and the share of its largest variance that the last of them has at least.
 PROCESS_COLUMNS, PROCESS_LEAST_VARIANCE = 96, 1e-3
-# Views whose covariance is drawn apart; beyond so many the others follow these (time: cubic).
+# Views (knots) whose covariance gives a process its shapes; the other views follow these (time: cubic).
 PROCESS_KNOTS = 400
 # Unmodelled joint effects whose size is sought with all variances, the likeliest (time).
 JOINT_EFFECTS_FITTED = 12

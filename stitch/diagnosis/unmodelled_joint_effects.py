@@ -22,7 +22,7 @@ Of all kinds of effects of all joints one may be there, each as likely before: w
 and of a joint the mean of its kinds.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -34,7 +34,6 @@ from stitch.diagnosis.smooth_processes import SmoothProcess, leading_trends, siz
 from stitch.diagnosis.systematic_laws import could_be_base
 from stitch.effects.contract import EFFECTS
 from stitch.model.model import term_of
-from stitch.numerics import parameter_selection
 from stitch.numerics.frames import Array
 from stitch.numerics.kernels import (
     SmoothErrors,
@@ -45,7 +44,7 @@ from stitch.numerics.kernels import (
     rbf_joints,
     short_range_kernel,
 )
-from stitch.numerics.parameter_selection import log_mean_exp
+from stitch.numerics.parameter_selection import ANY_SIZE, log_mean_exp
 from stitch.numerics.reml import VarianceFit, at_variances, fit_variances
 from stitch.observations.linear_model import LinearModel, with_pose_errors
 from stitch.observations.pose_errors import (
@@ -65,9 +64,10 @@ from stitch.observations.pose_errors import (
 )
 from stitch.session.torques import STILL
 
-# What not knowing its size costs an unmodelled effect, nats: as much as one with a name (`try_form`), so that neither
-# has an advantage.
-ANY_SIZE = -float(np.log(parameter_selection.ANY_SIZE[1.0]))
+# What a fitted size costs an unmodelled effect, nats. The prior of a named effect spreads over several sizes
+# (`try_form`), of which the plausible one has this share: an unmodelled effect pays as much, so that neither has an
+# advantage.
+SIZE_PENALTY = -float(np.log(ANY_SIZE[1.0]))
 JOINT_ANGLES = "the joint angles"
 # By kind of effect what it follows, in words.
 _FOLLOWED = {
@@ -81,7 +81,7 @@ _FOLLOWED = {
     JOINT_LOAD: "its load",
 }
 _DEGREES = float(np.degrees(1.0))
-_PLACES = 25  # of a curve, over the range of a joint
+_CURVE_POINTS = 25  # over the range of the covariate
 
 
 @dataclass(frozen=True)
@@ -89,38 +89,40 @@ class JointEffect:
     """One joint that errs by an unmodelled effect."""
 
     joint: int  # counted from 1
-    follows: str  # ALL_ANGLES, TWO_ANGLES, OWN_ANGLE, WAVES, …
-    process: int  # of that kind; the likeliest, where a joint has several
-    log_bayes_factor: float  # over everything else that may be there, at the likeliest size; their mean, of several
-    base: LinearModel  # without the effect
+    follows: str  # what its function depends on: ALL_ANGLES, TWO_ANGLES, OWN_ANGLE, WAVES, …
+    process: int  # index of its random function in `errors`
+    log_bayes_factor: float  # over the model `base`, at the fitted size
+    base: LinearModel  # without the effect, with all other pose errors
     fit: VarianceFit | None = None  # of the views with it; None where it was only sized at the null's variances
     may_follow: tuple[str, ...] = ()  # in words, the likeliest first: what 20 to 1 does not tell apart
 
     @property
     def errors(self) -> SmoothErrors:
-        """The errors of its kind, of all joints."""
+        """The random functions of this kind, of all joints."""
         return _joint_processes(self.base)[self.follows]
 
     @property
-    def usual(self) -> float:
-        """The size of which its columns are, rad."""
+    def typical_size(self) -> float:
+        """The joint's error, rad, for which `errors` hold the twists of the views."""
         return float(term_of(self.base.measurement, EFFECTS["joint_offset"]).typical[self.joint - 1])
 
     @cached_property
     def place(self) -> str:
-        """Where the effect acts, in words: joint 2, or also the base where that would explain the views as well."""
+        """Where the effect acts, in words: "joint 2", with the base where that would explain the views as well."""
+        joint = f"joint {self.joint}"
+        if self.follows not in (WITH_TIME, TIME_ONLY):
+            # The base has no joint angle that it could follow.
+            return joint
         kernel = self.errors.kernel_of(self.process)
-        error = _given_views(self, kernel, kernel)[0] / self.usual
+        error = _posterior_error(self, kernel, kernel)[0] / self.typical_size
         motions = self.errors.columns[:, self.process].reshape(len(error), 6)
         turned = self.model.reduce((motions * error[:, None]).reshape(-1, 1))[:, 0]
-        joint = f"joint {self.joint}"
-        in_time = self.follows in (WITH_TIME, TIME_ONLY)
-        or_base = in_time and could_be_base(self.model, turned, error[:, None])
+        or_base = could_be_base(self.model, turned, error[:, None])
         return f"{joint}, or the base about the same axis (these views cannot tell)" if or_base else joint
 
     @cached_property
     def model(self) -> LinearModel:
-        """The model with the effect as the last pose error, all sizes fitted."""
+        """The model `base` with the effect as the last component of its pose errors, all variances fitted."""
         base = self.base
         assert base.pose_errors is not None
         component = base.reduce(base.reduce(self.errors.twist_covariance(self.process)).T)
@@ -128,27 +130,48 @@ class JointEffect:
         mixed = with_pose_errors(base.mixed, errors)
         null = self.fit
         if null is None:
-            # At the maximum, sought from the likeliest of several starts.
+            # The likelihood has several maxima: the fit begins at the likeliest of several starts.
             nulls = [at.null.variances for at in (base, *base.alternative_starts)]
-            sizes = [times * SMOOTH_SCALE**2 for times in limits.UNMODELLED_VARIANCES]
-            starts: list[Array] = [np.append(variances, size) for variances in nulls for size in sizes]
+            variances_of_effect = [times * SMOOTH_SCALE**2 for times in limits.UNMODELLED_VARIANCES]
+            starts: list[Array] = [np.append(variances, own) for variances in nulls for own in variances_of_effect]
             null = fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))
         return replace(base, mixed=mixed, pose_errors=errors, null=null, full_model=None)
 
 
 def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tuple[JointEffect, ...]:
-    """Return the unmodelled effect of each kind for each joint with its log Bayes factor, likeliest first.
+    """Return one unmodelled effect for each joint and each kind, likeliest first.
 
-    An unmodelled effect is a smooth random function of what it follows, such as the joint's angle. All variances are
-    fitted again for the likeliest few; the others have a bound, their gain at the null's variances. Sizes are fitted,
-    for which `log_posterior_of_any` charges. () without joints, or where pose errors have no prior.
+    An unmodelled effect is a smooth random function of what it follows, such as the joint's angle. Where a joint has
+    several functions of a kind, as for each other joint, the likeliest stands for all, with their mean Bayes factor.
+    Sizes are fitted, for which `log_posterior_of_any` charges. () without joints, or where pose errors have no prior.
 
     Args:
-        kinds: what the effects follow; None: all kinds.
+        kinds: what the effects follow, as OWN_ANGLE; None: all kinds.
     """
-    processes = _joint_processes(base)
-    tried = list[JointEffect]()
-    for follows, errors in processes.items():
+    effects = sorted(_effects_at_null_variances(base, kinds), key=lambda effect: -effect.log_bayes_factor)
+    # All variances are fitted again for the likeliest few. The others keep a lower bound: their gain without that.
+    for k, effect in enumerate(effects[: limits.JOINT_EFFECTS_FITTED]):
+        null = effect.model.null
+        effects[k] = replace(effect, log_bayes_factor=0.5 * (base.null.deviance - null.deviance), fit=null)
+    by_kind: dict[tuple[int, str], list[JointEffect]] = {}
+    for effect in effects:
+        by_kind.setdefault((effect.joint, effect.follows), []).append(effect)
+    likeliest = [
+        replace(
+            max(of_kind, key=lambda effect: effect.log_bayes_factor),
+            log_bayes_factor=float(log_mean_exp([effect.log_bayes_factor for effect in of_kind])),
+        )
+        for of_kind in by_kind.values()
+    ]
+    return tuple(sorted(likeliest, key=lambda effect: -effect.log_bayes_factor))
+
+
+def _effects_at_null_variances(base: LinearModel, kinds: Sequence[str] | None) -> Iterator[JointEffect]:
+    """Yield all unmodelled effects of these kinds, with the log Bayes factors of their likeliest sizes.
+
+    The variances of all other errors stay those of the null fit.
+    """
+    for follows, errors in _joint_processes(base).items():
         if kinds is not None and follows not in kinds:
             continue
         for process, joint in enumerate(errors.joints):
@@ -156,47 +179,24 @@ def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tupl
             shapes = kernel @ leading_trends(kernel, len(kernel))
             motions = errors.columns[:, process].reshape(-1, 6, 1)
             _, gain = size_process(base, SmoothProcess(joint + 1, motions, shapes))
-            tried.append(JointEffect(joint + 1, follows, process, gain, base))
-    tried.sort(key=lambda effect: -effect.log_bayes_factor)
-    for k, effect in enumerate(tried[: limits.JOINT_EFFECTS_FITTED]):
-        null = effect.model.null
-        tried[k] = replace(effect, log_bayes_factor=0.5 * (base.null.deviance - null.deviance), fit=null)
-    by_kind: dict[tuple[int, str], list[JointEffect]] = {}
-    for effect in tried:
-        by_kind.setdefault((effect.joint, effect.follows), []).append(effect)
-    # Which of a joint's effects of a kind it is, nobody knows: the likeliest has the mean Bayes factor of all.
-    likeliest = [
-        replace(
-            max(effects, key=lambda effect: effect.log_bayes_factor),
-            log_bayes_factor=float(log_mean_exp([effect.log_bayes_factor for effect in effects])),
-        )
-        for effects in by_kind.values()
-    ]
-    return tuple(sorted(likeliest, key=lambda effect: -effect.log_bayes_factor))
-
-
-def joint_effect_log_posterior(base: LinearModel) -> float:
-    """Return the log posterior that some joint has an unmodelled effect, comparable with those of effects (`Ranked`).
-
-    −∞ where none can be tested.
-    """
-    effects = joint_effects(base)
-    factors = np.array([effect.log_bayes_factor for effect in effects])
-    return float(log_posterior_of_any(factors)) if effects else -np.inf
+            yield JointEffect(joint + 1, follows, process, gain, base)
 
 
 def log_posterior_of_any(log_bayes_factors: Array) -> Array:
-    """Return (…) log posterior that one of the effects is there, from the log Bayes factors (L, …) of each.
+    """Return (…) the log posterior, not yet normalised, that one of L unmodelled effects is there.
 
-    All kinds of effects of all joints share the prior alike, and none of their sizes is known.
+    It is log(prior × mean Bayes factor) − `SIZE_PENALTY`: the effects share one prior equally, hence the mean over L.
+
+    Args:
+        log_bayes_factors: (L, …) of each effect over nothing, at its fitted size.
     """
-    return log_mean_exp(log_bayes_factors) + np.log(limits.PRIOR_UNKNOWN) - ANY_SIZE
+    return log_mean_exp(log_bayes_factors) + np.log(limits.PRIOR_UNKNOWN) - SIZE_PENALTY
 
 
 def joint_effect_covariances(base: LinearModel) -> list[list[Array]]:
-    """Return covariances (n, n) of unmodelled effects of usual size in the reduced observations.
+    """Return for each joint and kind the covariances (n, n) of its unmodelled effects in the reduced observations.
 
-    Each inner list holds those of one kind for one joint.
+    The effects are of usual size.
     """
     return [
         [SMOOTH_SCALE**2 * base.reduce(base.reduce(smooth.twist_covariance(p)).T) for p in smooth.of_joint(joint)]
@@ -206,78 +206,78 @@ def joint_effect_covariances(base: LinearModel) -> list[list[Array]]:
 
 
 def significant_joint_effects(linear: LinearModel) -> tuple[JointEffect, ...]:
-    """Return unmodelled effects of single joints of which one is there, likeliest first, () if none is.
+    """Return the unmodelled effects of single joints of which one is there, likeliest first; () where none is clear.
 
-    With the likeliest joint come those that 20 to 1 does not tell from it, each by its likeliest kind of effect, with
-    the log Bayes factor of its kinds together over all that the prior holds. Where none stands out beside all else, one
-    that is 20 to 1 over none where joints and links err by it alone, and explains no less than all of them together.
+    Joints are scored beside all other pose errors first. If none is clear there, they are scored again without the
+    random errors of all joints and links, which can do what one joint does: then the likeliest joint has to explain at
+    least as much as all of those together. Joints that 20 to 1 does not tell from the likeliest are returned with it.
     """
-    beside_all = _likeliest_per_joint(joint_effects(linear))
-    if beside_all or not _joint_processes(linear):
-        return beside_all
+    beside_arm = _likeliest_per_joint(joint_effects(linear))
+    if beside_arm or not _joint_processes(linear):
+        return beside_arm
     without_arm = linear.restricted(NOT_OF_ARM)
-    alone = joint_effects(without_arm)
-    of_all = 0.5 * (without_arm.null.deviance - linear.null.deviance)
-    if alone[0].log_bayes_factor < of_all:
+    in_place_of_arm = joint_effects(without_arm)
+    gain_of_arm = 0.5 * (without_arm.null.deviance - linear.null.deviance)
+    if in_place_of_arm[0].log_bayes_factor < gain_of_arm:
         return ()
-    likeliest = _likeliest_per_joint(alone)
-    return tuple(replace(effect, log_bayes_factor=effect.log_bayes_factor - of_all) for effect in likeliest)
+    likeliest = _likeliest_per_joint(in_place_of_arm)
+    return tuple(replace(effect, log_bayes_factor=effect.log_bayes_factor - gain_of_arm) for effect in likeliest)
 
 
 def _joint_processes(base: LinearModel) -> dict[str, SmoothErrors]:
-    """Return what each joint alone may do without a name, by kind; empty where pose errors have no prior."""
+    """Return by kind the random functions by which a single joint may err; empty where pose errors have no prior."""
     return {} if base.pose_errors is None else base.pose_errors.joint_processes
 
 
 def _likeliest_per_joint(effects: Sequence[JointEffect]) -> tuple[JointEffect, ...]:
     """Return the likeliest effect of every joint that is within 20 to 1 of the likeliest joint.
 
-    `may_follow` lists the kinds within 20 to 1 of it. () where all effects together are not 20 to 1 over nothing.
+    Its log Bayes factor is that of all kinds of effects of the joint together: each of the L effects has 1/L of the
+    prior. `may_follow` lists the kinds within 20 to 1 of it. () where all effects together are not 20 to 1 over nothing.
 
     Args:
-        effects: of all kinds and joints, likeliest first.
+        effects: L of all kinds and joints, likeliest first.
     """
     if not effects or log_mean_exp([effect.log_bayes_factor for effect in effects]) <= limits.ODDS:
         return ()
     of_joint = {k: [e for e in effects if e.joint == k] for k in dict.fromkeys(effect.joint for effect in effects)}
-    together = {
+    of_all_kinds = {
         k: float(logsumexp([effect.log_bayes_factor for effect in of_joint[k]]) - np.log(len(effects)))
         for k in of_joint
     }
     likeliest = list[JointEffect]()
-    for k in sorted(together, key=lambda k: -together[k]):
-        if together[k] <= max(together.values()) - limits.ODDS:
+    for k in sorted(of_all_kinds, key=lambda k: -of_all_kinds[k]):
+        if of_all_kinds[k] <= max(of_all_kinds.values()) - limits.ODDS:
             continue
         best = of_joint[k][0]
         near = [e for e in of_joint[k] if e.log_bayes_factor > best.log_bayes_factor - limits.ODDS]
         may_follow = tuple(dict.fromkeys(_FOLLOWED[effect.follows] for effect in near))
-        likeliest.append(replace(best, log_bayes_factor=together[k], may_follow=may_follow))
+        likeliest.append(replace(best, log_bayes_factor=of_all_kinds[k], may_follow=may_follow))
     return tuple(likeliest)
 
 
 @dataclass(frozen=True)
 class JointCurve:
-    """How far a joint is off along one number that it follows, the rest where these views had it; beside its mean over
-    the views."""
+    """Error of a joint along one covariate, averaged over all else that it follows, less its mean over the views."""
 
     joint: int  # that errs, counted from 1
     covariate: str  # j3_deg; j3_move_deg, how far it came; time_s or view; j3_torque_nm, or j3_torque_nm_per_kg
-    share: float  # of what the effect does over the views, 0 … 1
+    share: float  # of the effect's variance over the views, 0 … 1
     at: Array  # (G,) of the covariate, in the unit that its name ends with
     error: Array  # (G,) of the joint that errs, rad
     sigma: Array  # (G,) of `error`, rad
     view_values: Array  # (V,) the covariate in the views
-    place: str  # the joint, and what turns the views alike
+    place: str  # the joint in words, and what turns the views as it does
     may_follow: tuple[str, ...] = ()  # what these views do not tell apart, the likeliest first
 
     @property
     def extremes(self) -> tuple[int, int]:
-        """Places at which the error is smallest and largest."""
+        """Indices (into `at`) of the smallest and of the largest error."""
         return int(np.argmin(self.error)), int(np.argmax(self.error))
 
 
 def joint_curves(effects: Sequence[JointEffect]) -> tuple[JointCurve, ...]:
-    """Return curves of each effect along everything that it follows, the largest share of its variance first.
+    """Return the curve of each effect along each of its covariates, those with the largest share of its variance first.
 
     A curve is a partial dependence (Friedman 2001, Ann. Stat. 29:1189): averaged over the other arguments. The effect
     is a random function; its mean and covariance given the observations are those of a Gaussian process (Rasmussen &
@@ -286,26 +286,26 @@ def joint_curves(effects: Sequence[JointEffect]) -> tuple[JointCurve, ...]:
     curves = list[JointCurve]()
     for effect in effects:
         kernel = effect.errors.kernel_of(effect.process)
-        variance = float(_given_views(effect, kernel, kernel)[0].var())
+        variance = float(_posterior_error(effect, kernel, kernel)[0].var())
         curves += [_curve_along(effect, covariate, variance) for covariate in _covariates(effect)]
     return tuple(sorted((c for c in curves if c.share > limits.CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
 
 @dataclass(frozen=True)
 class _Covariate:
-    """One number that an effect follows, and the factors of the effect's covariance."""
+    """One number that an effect follows, with the two factors of the effect's covariance: by it, and by all else."""
 
     name: str
     view_values: Array  # (V,)
-    kernel: Callable[[Array, Array], Array]  # (S, O) between places (S,) and (O,)
-    remaining_kernel: Array | float = 1.0  # (V, V) between views, by all that the effect follows beside it
-    unit: float = 1.0  # of the covariate per unit of `view_values`
+    kernel: Callable[[Array, Array], Array]  # factor (S, O) between values (S,) and (O,) of the number
+    remaining_kernel: Array | float = 1.0  # (V, V) factor between views, by all else that the effect follows
+    unit: float = 1.0  # the number as it is reported, per unit of `view_values`
 
 
 def _covariates(effect: JointEffect) -> list[_Covariate]:
-    """Return the arguments of an effect, by its kind, with the factors of its covariance for each.
+    """Return all numbers that an effect follows, each with the factors of the effect's covariance.
 
-    Covariances are products, one factor an argument: the remaining kernel is the product of the other factors.
+    The covariance is a product with one factor for each number: the remaining kernel is the product of the others.
     """
     k = effect.joint - 1
     views = effect.base.measurement.views
@@ -340,7 +340,7 @@ def _covariates(effect: JointEffect) -> list[_Covariate]:
 
 
 def _along_torques(effect: JointEffect) -> list[_Covariate]:
-    """Return the torques that bend a joint."""
+    """Return the torques that bend the joint of an effect, as its covariates; not those that never change."""
     torques = effect.base.measurement.views.torques
     kernel = effect.errors.kernel_of(effect.process)
     bending = [t for t, k in enumerate(torques.joint) if k == effect.joint - 1 and np.ptp(torques.values[:, t]) > STILL]
@@ -348,7 +348,7 @@ def _along_torques(effect: JointEffect) -> list[_Covariate]:
     for t in bending:
         torque = torques.values[:, t]
         along_torque = partial(exponential_kernel, reach=len(bending) * float(np.ptp(torque)))
-        # Of what is known to weigh something, or of 1 kg at a link.
+        # The name of a torque between two joints, as 2_3, means 1 kg at a link whose mass nobody states.
         name = f"j{torques.names[t]}_torque_nm" + ("_per_kg" if "_" in torques.names[t] else "")
         covariates.append(_Covariate(name, torque, along_torque, kernel / along_torque(torque, torque)))
     return covariates
@@ -357,61 +357,68 @@ def _along_torques(effect: JointEffect) -> list[_Covariate]:
 def _along_angle(
     joint: int, joints: Array, kernel: Callable[[Array, Array], Array], remaining_kernel: Array | float = 1.0
 ) -> _Covariate:
-    """Return the angle of a joint, counted from 0, of the views' joints (V, n) rad."""
+    """Return the angle of a joint, counted from 0, as a covariate reported in degrees.
+
+    Args:
+        joints: (V, n) angles of all joints in the views, rad.
+        kernel, remaining_kernel: as in `_Covariate`.
+    """
     return _Covariate(f"j{joint + 1}_deg", joints[:, joint], kernel, remaining_kernel, _DEGREES)
 
 
 def _smooth_in_angle(some: Array, others: Array) -> Array:
-    """Return (S, O) of a smooth function of one angle, (S,) and (O,) rad."""
+    """Return the covariance (S, O) of a smooth random function between angles (S,) and (O,), rad."""
     return rbf_joints(some[:, None], others[:, None])
 
 
 def _one_of_two_angles(some: Array, others: Array) -> Array:
-    """Return (S, O) the factor of one angle, (S,) and (O,) rad, in what follows two."""
+    """Return the factor (S, O) of `two_joint_kernel` for one of its two angles, between values (S,) and (O,), rad."""
     return 2 * _smooth_in_angle(some, others) - 1
 
 
 def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) -> JointCurve:
-    """Return the error of a joint along one covariate, averaged over where all else that it follows stood.
+    """Return the error of a joint along one covariate, averaged over the views' values of all else that it follows.
 
     Args:
-        variance: over the views of all that the effect does, rad²: the curve's share is of this.
+        variance: of the effect over the views, rad²; the curve's share is of this.
     """
-    at = covariate.view_values
-    views = len(at)
-    grid = np.linspace(at.min(), at.max(), _PLACES)
-    places = np.append(grid, at)
-    rest = np.broadcast_to(covariate.remaining_kernel, (views, views))
-    with_views = rest.mean(axis=0) * covariate.kernel(places, at)
-    with_places = rest.mean() * covariate.kernel(places, places)
-    centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_PLACES, views])
-    mean, covariance = _given_views(effect, centred @ with_views, centred @ with_places @ centred.T)
+    of_views = covariate.view_values
+    views = len(of_views)
+    grid = np.linspace(of_views.min(), of_views.max(), _CURVE_POINTS)
+    places = np.append(grid, of_views)
+    # Averaged over what else the effect follows: with each view's values of that, and with all pairs of views.
+    remaining = np.broadcast_to(covariate.remaining_kernel, (views, views))
+    with_views = remaining.mean(axis=0) * covariate.kernel(places, of_views)
+    with_places = remaining.mean() * covariate.kernel(places, places)
+    # Takes off the mean over the views, the last of the places.
+    centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_CURVE_POINTS, views])
+    mean, covariance = _posterior_error(effect, centred @ with_views, centred @ with_places @ centred.T)
     return JointCurve(
         joint=effect.joint,
         covariate=covariate.name,
-        share=min(float(mean[_PLACES:].var() / max(variance, 1e-300)), 1.0),
+        share=min(float(mean[_CURVE_POINTS:].var() / max(variance, 1e-300)), 1.0),
         at=covariate.unit * grid,
-        error=mean[:_PLACES],
-        sigma=np.sqrt(np.maximum(np.diag(covariance)[:_PLACES], 0)),
-        view_values=covariate.unit * at,
+        error=mean[:_CURVE_POINTS],
+        sigma=np.sqrt(np.maximum(np.diag(covariance)[:_CURVE_POINTS], 0)),
+        view_values=covariate.unit * of_views,
         may_follow=effect.may_follow,
         place=effect.place,
     )
 
 
-def _given_views(effect: JointEffect, with_views: Array, prior: Array) -> tuple[Array, Array]:
-    """Return by how much a joint errs at G places of its curve, given the views: regression of a Gaussian process.
+def _posterior_error(effect: JointEffect, with_views: Array, prior: Array) -> tuple[Array, Array]:
+    """Return mean (G,), rad, and covariance (G, G), rad², of a joint's error at G places, given the views.
+
+    Regression of a Gaussian process (Rasmussen & Williams 2006, eq. 2.41), with the fitted variance of the effect.
 
     Args:
-        with_views: (G, V) prior covariance of the error there with that at the views, per unit of its variance.
-        prior: (G, G) prior covariance of the errors there.
-
-    Returns:
-        Mean (G,), rad, and covariance (G, G), rad².
+        with_views: (G, V) prior covariance of the error at these places with that in the views, for variance 1.
+        prior: (G, G) prior covariance of the error among these places, for variance 1.
     """
     linear = effect.model
     variance = linear.null.variances[-1]
     motions = effect.errors.columns[:, effect.process].reshape(-1, 6, 1)
     white = linear.residual(linear.reduce((motions * with_views.T[:, None, :]).reshape(-1, len(with_views))))
     mean = variance * white.T @ linear.white_residual
-    return effect.usual * mean, effect.usual**2 * (variance * prior - variance**2 * white.T @ white)
+    size = effect.typical_size
+    return size * mean, size**2 * (variance * prior - variance**2 * white.T @ white)

@@ -32,10 +32,11 @@ from stitch.diagnosis.smooth_processes import (
     wandering_flange,
 )
 from stitch.diagnosis.unmodelled_joint_effects import (
-    ANY_SIZE,
     JOINT_ANGLES,
+    SIZE_PENALTY,
     JointEffect,
-    joint_effect_log_posterior,
+    joint_effects,
+    log_posterior_of_any,
     significant_joint_effects,
 )
 from stitch.numerics.frames import Array
@@ -63,9 +64,9 @@ _PERIOD_REFINEMENT = 17
 # Of a swing in which all that moves does so at once: one of these is within a sixteenth of a period of any phase.
 _PHASES = 8
 _SWING, _SWING_IN_PHASE, _STRETCH = "swing", "swing at once", "stretch"
-_PLACES = 6  # of a curve in time, from one view to the next
+_POINTS_PER_STEP = 6  # of a curve in time, from one view to the next
 ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
-# Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
+# What poses do that err by a kind of components.
 _FOLLOW_JOINTS, _WANDER_IN_TIME = "follow the joints", "wander in time"
 
 # Times (T,) in steps from view to view → shapes (T, R) of a process.
@@ -75,13 +76,16 @@ _DescribedTrend = tuple[str, str, _Trend, float | None]
 
 
 def time_processes(linear: LinearModel) -> list[SmoothProcess]:
-    """Return all motions of the flange by one shape in time that are tried, of any size and direction in its frame."""
+    """Return all courses in time that are tried for the flange: swings of many periods, and stretches of many lengths.
+
+    Each may move the flange by any amount along and about every axis of its frame.
+    """
     time = time_in_steps(linear.measurement)
     span = max(float(np.ptp(time)), 1.0)
-    apart = max(limits.FREQUENCY_STEP / span, limits.FASTEST_SWING / limits.MOST_FREQUENCIES)
-    frequencies = np.arange(limits.LEAST_SWINGS / span, limits.FASTEST_SWING, apart)
+    spacing = max(limits.FREQUENCY_STEP / span, limits.FASTEST_SWING / limits.MOST_FREQUENCIES)
+    frequencies = np.arange(limits.LEAST_SWINGS / span, limits.FASTEST_SWING, spacing)
     swings = list(_swings(linear, frequencies))
-    # With one phase for all motions, as where one temperature moves them: half as many numbers.
+    # With one phase for all six motions, as where one temperature moves them: half as many numbers.
     in_phase = [
         (_SWING_IN_PHASE, words, partial(_wave_at_phase, waves, k * np.pi / _PHASES), frequency)
         for _, words, waves, frequency in swings
@@ -91,11 +95,11 @@ def time_processes(linear: LinearModel) -> list[SmoothProcess]:
 
 
 def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | None:
-    """Return the likeliest motion of the flange in time beside a model, and the log Bayes factor of all those tried.
+    """Return the likeliest motion of the flange in time beside a model, and the log Bayes factor that there is any.
 
-    Of each kind of trends one may be there, each kind and each of its trends as likely before: what counts is the mean
-    of their Bayes factors. All variances are sought anew for the likeliest few; for the others that is a bound. None
-    where poses have no prior of errors, or a session is too short for any.
+    That factor is the mean over kinds (swing, stretch, …) of the mean Bayes factor of each kind. All variances are
+    fitted again for the likeliest few; the others keep a lower bound, their gain without that. None where pose errors
+    have no prior, or the session is too short for any.
     """
     processes = [] if linear.pose_errors is None else time_processes(linear)
     if not processes:
@@ -113,15 +117,11 @@ def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | 
 
 
 def significant_time_effect(linear: LinearModel) -> FittedProcess | None:
-    """Return the likeliest motion of the flange in time, a swing or a stretch, where it is 20 to 1 likelier than none.
+    """Return the likeliest motion of the flange in time, a swing or a stretch; None where none is 20 to 1 over nothing.
 
-    It is sought beside all else that poses may do, drift included; where nothing stands out there, in place of drift,
-    which can do what a stretch does, so that beside it a stretch gains nothing: then it has to gain at least what drift
-    does. A swing comes with the likeliest of all periods near its own.
-
-    Returns:
-        The motion, with the log Bayes factor of all that were tried, at their likeliest sizes as with a joint's effect
-        (`significant_joint_effects`); None where none is clear.
+    It is sought beside all other pose errors first. If nothing is clear there, it is sought without drift, which can do
+    what a stretch does: then it has to gain at least as much as drift does. The period of a swing is refined at last.
+    The log Bayes factor is that there is any such motion, at fitted sizes (`likeliest_time_effect`).
     """
     base = linear
     gain_of_drift = 0.0
@@ -144,12 +144,14 @@ def unmodelled_log_posterior(base: LinearModel) -> float:
     It is comparable with those of effects (`Ranked`); −∞ where neither can be tested.
     """
     in_time = likeliest_time_effect(base)
-    of_flange = -np.inf if in_time is None else in_time[1] - ANY_SIZE + float(np.log(limits.PRIOR_UNKNOWN))
-    return max(joint_effect_log_posterior(base), of_flange)
+    of_flange = -np.inf if in_time is None else in_time[1] - SIZE_PENALTY + float(np.log(limits.PRIOR_UNKNOWN))
+    factors = np.array([effect.log_bayes_factor for effect in joint_effects(base)])
+    of_joint = float(log_posterior_of_any(factors)) if len(factors) else -np.inf
+    return max(of_joint, of_flange)
 
 
 def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProcess:
-    """Return the likeliest of the swings whose periods lie between those that were tried next to this one.
+    """Return the likeliest of the swings with periods near that of `swing`, more finely spaced than those tried.
 
     They are compared at the variances of its fit; the likeliest is fitted with variances of its own.
     """
@@ -159,13 +161,23 @@ def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProce
     reach = limits.FREQUENCY_STEP / max(float(np.ptp(time)), 1.0)
     frequencies = frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)
     beside = replace(base, null=swing.fit)
-    near = [(p, *size_process(beside, p)) for p in _processes(base, time, _swings(base, frequencies))]
-    process, size, _ = max(near, key=lambda sized: sized[2])
+    process, size, _ = max(
+        _sized(beside, _processes(base, time, _swings(base, frequencies))), key=lambda sized: sized[2]
+    )
     return fit_process(base, process, size, tried=1)
 
 
+def _sized(linear: LinearModel, processes: Iterable[SmoothProcess]) -> list[tuple[SmoothProcess, float, float]]:
+    """Return processes, each with its likeliest size at the null's variances and its log Bayes factor there."""
+    return [(process, *size_process(linear, process)) for process in processes]
+
+
 def _processes(linear: LinearModel, time: Array, trends: Iterable[_DescribedTrend]) -> list[SmoothProcess]:
-    """Return motions of the flange, in its own frame, that follow these trends over time (V,), in steps."""
+    """Return processes of a flange that moves by these trends, along and about every axis of its own frame.
+
+    Args:
+        time: (V,) of the views, in steps.
+    """
     carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return [
         SmoothProcess(None, carried, trend(time), kind, words, trend, frequency)
@@ -174,7 +186,7 @@ def _processes(linear: LinearModel, time: Array, trends: Iterable[_DescribedTren
 
 
 def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedTrend]:
-    """Yield sines, of another phase in each motion, in words."""
+    """Yield the trend of a swing for each frequency (1/step); all six motions swing with phases of their own."""
     for f in map(float, frequencies):
         yield _SWING, f"swing to and fro about every {_duration_in_words(linear, 1 / f)}", partial(_waves, f), f
 
@@ -191,13 +203,17 @@ def _wave_at_phase(waves: _Trend, phase: float, time: Array) -> Array:
 
 
 def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedTrend]:
-    """Yield bumps that begin and end within the session, in words."""
+    """Yield the trends of stretches: Gaussian bumps that begin and end within the session, from narrow to wide.
+
+    Args:
+        time: (V,) of the views, in steps.
+    """
     first = float(time.min())
     last = float(time.max())
     views = linear.measurement.views
     width = limits.SHORTEST_STRETCH
     while width <= limits.LONGEST_STRETCH * (last - first):
-        # A grid of this width within the session, where there are views: it may hold breaks of days.
+        # Middles a width apart, only where there are views: the session may hold breaks of days.
         steps = np.floor((time - first) / width)
         middles = first + width * np.unique([steps, steps + 1])
         for middle in middles[(middles > first) & (middles < last - width / 2)]:
@@ -210,7 +226,7 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedTrend]:
 
 
 def _bump(middle: float, width: float, time: Array) -> Array:
-    """Return (T, 1) of unit height, with its standard deviation `width`."""
+    """Return (T, 1) a Gaussian of height 1 and standard deviation `width`, all in steps."""
     return np.exp(-0.5 * ((time - middle) / width) ** 2)[:, None]
 
 
@@ -222,7 +238,7 @@ def _duration_in_words(linear: LinearModel, steps: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TimeCurve(Value):
-    """How far the flange turns and moves in time, in its own frame, beside where it stands otherwise.
+    """How far the flange is off in time, in its own frame, by one swing or stretch.
 
     Example:
         >>> stitch.diagnose(run).time_curve is None  # of a flange that does not
@@ -250,18 +266,22 @@ class TimeCurve(Value):
 
 
 def time_curve(fitted: FittedProcess) -> TimeCurve:
-    """Return what the flange does in time, and its sigma: a free fit at the fitted sizes of all other errors."""
+    """Return what the flange does in time by a fitted process, with its sigma.
+
+    The process is fitted freely, its prior so wide that it pulls at nothing, at the fitted variances of all else.
+    """
     linear = fitted.base
     assert fitted.process.trend is not None
     time = np.sort(time_in_steps(linear.measurement))
-    places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
+    places = np.linspace(0, len(time) - 1, _POINTS_PER_STEP * (len(time) - 1) + 1)
     steps = np.interp(places, np.arange(len(time)), time)
     shapes = fitted.process.trend(steps)
-    wide = np.full(fitted.columns.shape[1], limits.FREE_SIZES * fitted.size)
-    fit = at_variances(linear.mixed, fitted.fit.variances, linear.in_blocks(fitted.columns), wide)
-    # Of every motion of the flange one coefficient for each shape.
-    coefficients = fit.mean[-len(wide) :].reshape(6, -1)
-    covariance = fit.covariance[-len(wide) :, -len(wide) :].reshape(*coefficients.shape, *coefficients.shape)
+    free_sizes = np.full(fitted.columns.shape[1], limits.FREE_SIZES * fitted.size)
+    fit = at_variances(linear.mixed, fitted.fit.variances, linear.in_blocks(fitted.columns), free_sizes)
+    # Six motions of the flange, each with one coefficient for each shape: the last of the fit's amplitudes.
+    count = len(free_sizes)
+    coefficients = fit.mean[-count:].reshape(6, -1)
+    covariance = fit.covariance[-count:, -count:].reshape(*coefficients.shape, *coefficients.shape)
     variance = np.einsum("gr,prps,gs->gp", shapes, covariance, shapes)
     unit = usual_twist(linear.measurement.length_unit)
     # Where the flange carries the part, the views move the other way.
@@ -277,60 +297,54 @@ def time_curve(fitted: FittedProcess) -> TimeCurve:
 def unmodelled_trends(linear: LinearModel) -> tuple[FittedProcess, ...]:
     """Return the likeliest smooth errors of a joint or of the flange in time, fitted beside a model, best first.
 
-    All are sized at the null's variances, joints in pairs only for the clearest ones; the best `TRENDS_FITTED` are then
-    fitted. () where pose errors have a prior, which contains such errors already.
+    All are sized at the null's variances; those of one joint that also follow another only for the clearest joints. The
+    best `TRENDS_FITTED` are then fitted. () where pose errors have a prior, which contains such errors already.
     """
     if regime_of(linear).prior:
         return ()
-    flange = wandering_flange(linear)
-    sized = [(flange, *size_process(linear, flange))]
+    sized = _sized(linear, [wandering_flange(linear)])
     if linear.measurement.views.has("joints"):
         motions = joint_motions(linear)
-
-        def sized_of_joint(
-            processes: Callable[[LinearModel, Array, int], Iterator[SmoothProcess]], k: int
-        ) -> list[tuple[SmoothProcess, float, float]]:
-            return [(process, *size_process(linear, process)) for process in processes(linear, motions, k)]
-
-        by_joint = list(parallel(partial(sized_of_joint, single_joint_processes), range(len(motions))))
-        clearest = sorted(range(len(by_joint)), key=lambda k: -max(gain for _, _, gain in by_joint[k]))
-        pairs = parallel(partial(sized_of_joint, joint_pair_processes), clearest[: limits.PAIRED_JOINTS])
-        sized += [process for of_joint in (*by_joint, *pairs) for process in of_joint]
+        joints = range(len(motions))
+        singles = list(parallel(lambda k: _sized(linear, single_joint_processes(linear, motions, k)), joints))
+        clearest = sorted(joints, key=lambda k: -max(gain for _, _, gain in singles[k]))[: limits.PAIRED_JOINTS]
+        pairs = parallel(lambda k: _sized(linear, joint_pair_processes(linear, motions, k)), clearest)
+        sized += [process for of_joint in (*singles, *pairs) for process in of_joint]
     likeliest = sorted(sized, key=lambda process: -process[2])[: limits.TRENDS_FITTED]
     fitted = parallel(lambda process: fit_process(linear, process[0], process[1], len(sized)), likeliest)
     return tuple(sorted(fitted, key=lambda process: -process.log_bayes_factor))
 
 
 def least_log_bayes_factor(linear: LinearModel, scored: Score) -> tuple[float, str]:
-    """Return the least log Bayes factor of an effect with an unnamed smooth trend in the model, and the trend in words.
+    """Return an effect's log Bayes factor beside the unnamed smooth trend that leaves it least, and the trend in words.
 
     (∞, "") where pose errors have a prior: the effect was scored beside such trends already.
     """
-
-    def factor_beside(trend: FittedProcess) -> float:
-        """Return the log Bayes factor of the effect beside a trend, at the likelier of the sizes that that may have."""
-        both = linear.in_blocks(np.hstack([trend.columns, scored.form.columns]))
-        size = np.full(trend.columns.shape[1], trend.size)
-        priors = [np.append(times * size, scored.sizes) for times in limits.TREND_SIZES]
-        start = trend.fit.variances
-        return 0.5 * (trend.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
-
     trends = unmodelled_trends(linear)
-    beside = zip(parallel(factor_beside, trends), (trend.words for trend in trends), strict=True)
-    return min(beside, default=(np.inf, ""))
+    factors = parallel(partial(_log_bayes_factor_beside, linear, scored), trends)
+    return min(zip(factors, (trend.words for trend in trends), strict=True), default=(np.inf, ""))
+
+
+def _log_bayes_factor_beside(linear: LinearModel, scored: Score, trend: FittedProcess) -> float:
+    """Return the log Bayes factor of an effect beside a trend, which takes the likeliest of `TREND_SIZES`."""
+    both = linear.in_blocks(np.hstack([trend.columns, scored.form.columns]))
+    size = np.full(trend.columns.shape[1], trend.size)
+    priors = [np.append(times * size, scored.sizes) for times in limits.TREND_SIZES]
+    start = trend.fit.variances
+    return 0.5 * (trend.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
 
 
 @dataclass(frozen=True)
 class RepeatingError:
-    """One kind of errors that repeat, beside all others."""
+    """One kind of pose errors without a name that repeat: with the joints, in time, or at a stop."""
 
     words: str  # "they …"
-    log_bayes_factor: float  # over the same errors without it
-    joints: bool  # follows the pose rather than time
+    log_bayes_factor: float  # of all pose errors over all but this kind
+    joints: bool  # True: they follow the joints; False: time, or the stops
     of_one: bool = False  # one joint, or one trend in time, stands out
     joint_effects: tuple[JointEffect, ...] = ()  # of single joints, where they are clear
     curve: TimeCurve | None = None  # of the flange in time, where that is clear
-    process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
+    process: FittedProcess | None = None  # fitted with all variances, where the null counts it as scatter
 
 
 def reportable(errors: tuple[RepeatingError, ...], implausible: bool) -> tuple[RepeatingError, ...]:
@@ -344,19 +358,36 @@ def reportable(errors: tuple[RepeatingError, ...], implausible: bool) -> tuple[R
 
 
 def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
-    """Return kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
+    """Return the kinds of pose errors that repeat, clearest first; () where scatter explains the views as well.
 
-    Without a prior of pose errors the likeliest alone (`unmodelled_trends`).
-
-    Each is left out of the prior in turn, all other sizes fitted anew. A size that is not wanted goes to where its
-    prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
-    three nats (`reml`), which the odds of 20 to 1 stand for.
+    Without a prior of pose errors it is the likeliest trend alone (`unmodelled_trends`). With one, all kinds together
+    must be 20 to 1 over scatter; then those are returned without which the views are 20 to 1 less likely. A single
+    joint, or a single trend in time, that stands out takes the place of its kind.
     """
     if linear.pose_errors is None:
         return _trend_errors(linear)
     single = _single_error(linear)
     if 0.5 * (linear.restricted({JOINT_SCATTER}).null.deviance - linear.null.deviance) < limits.ODDS:
         return () if single is None else (single,)
+    errors = _error_kinds(linear)
+    required = sorted((e for e in errors if e.log_bayes_factor > limits.ODDS), key=lambda e: -e.log_bayes_factor)
+    if single is not None:
+        # What one joint does is part of what follows the joints, and as clear.
+        same_kind = [e.log_bayes_factor for e in errors if e.joints == single.joints]
+        single = replace(single, log_bayes_factor=max([single.log_bayes_factor, *same_kind]))
+        return (single, *(e for e in required if e.joints != single.joints))
+    # Where each can stand in for the other, none is required: the likelier alone is said to be there.
+    return tuple(required) or (max(errors, key=lambda e: e.log_bayes_factor),)
+
+
+def _error_kinds(linear: LinearModel) -> list[RepeatingError]:
+    """Return the kinds of errors that the prior of pose errors holds, with the log Bayes factor of each.
+
+    Each kind is left out of the prior in turn, and all other sizes are fitted again. A size that is not wanted goes to
+    where its prior piles up and costs nothing. One that is wanted pays for its prior's tail alone and not for its
+    width, about three nats (`reml`), which the odds of 20 to 1 stand for.
+    """
+    assert linear.pose_errors is not None
     names = linear.pose_errors.names
     of_arm = tuple(name for name, own in zip(names, linear.pose_errors.arm_components, strict=True) if own)
     kinds = {
@@ -364,30 +395,24 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
         _WANDER_IN_TIME: tuple(DRIFT_MEMORY),
         "are shared by the scans of a stop": STOP_COMPONENTS,
     }
-    errors = [
-        RepeatingError(
-            words, 0.5 * (_deviance_without(linear, kind) - linear.null.deviance), joints=words == _FOLLOW_JOINTS
-        )
-        for words, kind in kinds.items()
-        if any(name in kind for name in names)
-    ]
-    wanted = sorted((e for e in errors if e.log_bayes_factor > limits.ODDS), key=lambda e: -e.log_bayes_factor)
-    if single is not None:
-        # What one joint does is part of what follows the joints, and as clear.
-        alike = [e.log_bayes_factor for e in errors if e.joints == single.joints]
-        single = replace(single, log_bayes_factor=max([single.log_bayes_factor, *alike]))
-        return (single, *(e for e in wanted if e.joints != single.joints))
-    # Where each can stand in for the other, the likelier alone is said to be there.
-    return tuple(wanted) or (max(errors, key=lambda e: e.log_bayes_factor),)
+    errors = list[RepeatingError]()
+    for words, kind in kinds.items():
+        if any(name in kind for name in names):
+            gain = 0.5 * (_deviance_without(linear, kind) - linear.null.deviance)
+            errors.append(RepeatingError(words, gain, joints=words == _FOLLOW_JOINTS))
+    return errors
 
 
 def _single_error(linear: LinearModel) -> RepeatingError | None:
-    """Return the error of one joint or of the flange in time; in the words of both where 20 to 1 tells neither."""
+    """Return the clear error of a single joint or of the flange in time, the likelier of the two; None without any.
+
+    Where the two are within 20 to 1, its words name both.
+    """
     errors = list[RepeatingError]()
     effects = significant_joint_effects(linear)
     if effects:
         which = " or ".join(effect.place for effect in sorted(effects, key=lambda effect: effect.joint))
-        followed = dict.fromkeys(number for effect in effects for number in effect.may_follow)
+        followed = dict.fromkeys(covariate for effect in effects for covariate in effect.may_follow)
         # Of functions that nobody knows none is certain to be of the kind that explains most.
         words = f"come from {which} above all, likeliest by {' or '.join(followed)}"
         if JOINT_ANGLES in followed:
@@ -423,11 +448,15 @@ def _trend_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
 
 
 def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
-    """Return the deviance of the null without some components."""
+    """Return the deviance of the null fit without some components of the pose errors, by name: the lesser of two fits.
+
+    One begins at the variances of the null fit; the other at those without any pose errors, which start small.
+    """
     assert linear.pose_errors is not None and linear.mixed.further is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     components = np.append(np.ones(NOISE + 1, bool), keep)
     further = linear.mixed.further.select(keep)
     mixed = replace(linear.mixed, components=linear.mixed.components[components], further=further)
-    plain = np.append(linear.restricted(()).null.variances, 1e-2 * further.scales**2)
-    return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[components], plain))
+    nearly_absent = np.append(linear.restricted(()).null.variances, 1e-2 * further.scales**2)
+    starts = (linear.null.variances[components], nearly_absent)
+    return min(fit_variances(mixed, start=start).deviance for start in starts)

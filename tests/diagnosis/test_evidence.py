@@ -304,7 +304,8 @@ def test_no_second_effect_is_found_beside_one_that_is_alone(cell, play, drift):
 
 
 @pytest.mark.parametrize(
-    ("pair", "verdict", "named"), [((FIRST, SECOND), "missing_effect", (FIRST,)), (None, "cannot_tell", (FIRST, SECOND))]
+    ("pair", "verdict", "named"),
+    [((FIRST, SECOND), "missing_effect", (FIRST,)), (None, "cannot_tell", (FIRST, SECOND))],
 )
 def test_of_few_views_effects_that_come_near_each_other_are_a_group_unless_both_are_missing(
     monkeypatch, pair, verdict, named

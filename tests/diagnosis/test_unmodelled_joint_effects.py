@@ -21,7 +21,7 @@ from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sentences import curve_sentences, joint_curve_sentence
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import (
-    ANY_SIZE,
+    SIZE_PENALTY,
     joint_curves,
     joint_effects,
     log_posterior_of_any,
@@ -77,7 +77,7 @@ def test_that_some_law_is_there_is_their_mean_over_a_twentieth():
     """However many kinds of laws are asked for: those that explain nothing take their share of the prior."""
     factors = np.array([50.0, 3.0, 1.0, 0.0])
     asked = log_posterior_of_any(np.log(np.maximum(factors, 1e-300))[:, None])
-    assert asked.shape == (1,) and np.exp(asked[0] + ANY_SIZE) == pytest.approx(0.05 * factors.mean())
+    assert asked.shape == (1,) and np.exp(asked[0] + SIZE_PENALTY) == pytest.approx(0.05 * factors.mean())
 
 
 def test_no_joint_is_told_where_poses_wander(cell):
