@@ -55,12 +55,12 @@ from stitch.session.capture import build_capture
 from stitch.session.measurement import Measurement
 from stitch.session.robot import forward
 
-# Poses that are tried, and again close to the best of them.
-_TRIED, _CLOSER, _BEST = 72, 24, 3
-# Times that poses are sought, until there are enough to try.
+# Poses that are tried; then the best of them again, with so many poses close to those.
+_TRIED, _BEST, _CLOSE_TO_BEST = 72, 3, 24
+# Times at the most that random poses are drawn, until there are enough to try.
 _SEARCHES = 6
-# How much a pose sees is asked of so many points of the scans; less than this share of what the views see is too
-# little, and of a surface that is turned farther away (cosine) nothing is seen. The field reaches a tenth farther.
+# Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, the least
+# cosine at which a surface is seen, and by which share of its size the field of the scans is widened.
 _POINTS, _LEAST_SEEN, _FACING, _MARGIN = 300, 0.5, 0.2, 0.1
 # Views that are proposed at the most, and the odds at which one more is not needed.
 MOST_VIEWS, SURE = 3, 0.95
@@ -68,8 +68,8 @@ MOST_VIEWS, SURE = 3, 0.95
 _WORTH = 0.02
 # Draws of each rival for the search, and for the odds that are stated.
 _SEARCH_DRAWS, _STATED_DRAWS = 96, 2000
-# Forms of a rival that compete, of those within so many nats of its best.
-_FORMS, _NEAR_FORMS = 5, 6.0
+# Forms of a rival that compete at the most, and the nats by which they may be behind its best.
+_FORMS, _BEHIND_BEST = 5, 6.0
 # What a joint without a law may follow, of which a pose alone tells what is expected there.
 _BY_POSE = (ALL_ANGLES, OWN_ANGLE, TWO_ANGLES)
 # Shares of the session's duration that one may wait where a rival goes with time.
@@ -87,27 +87,35 @@ class DecidingViews:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival expects of N further views, m numbers each."""
+    """What a rival predicts of N further views, m numbers each: a normal distribution in three parts."""
 
     mean: Array  # (N, m)
-    unknown: Array  # (N, m, q) root of the covariance by what the rival does not know of itself
-    shared: Array | None  # (N, m, N, m) covariance of all else; None: independent between views
-    own: Array  # (N, m, m) covariance of each view beside
+    coefficient_root: Array  # (N, m, q) root of the covariance by coefficients that the views taken leave uncertain
+    shared: Array | None  # (N, m, N, m) covariance of pose errors; None: independent between views
+    per_view: Array  # (N, m, m) covariance of what is independent between views, as noise
     design: Array  # (N, m, a) of hand-eye and effects in use
 
     def of(self, chosen: Sequence[int], more: Indices) -> tuple[Array, Array]:
-        """Return mean (C, D) and covariance (C, D, D) of the chosen views, each time with one of `more` (C,)."""
-        stacks = np.column_stack([np.tile(np.array(chosen, np.int64), (len(more), 1)), more])
-        C, k = stacks.shape
+        """Return mean (C, D) and covariance (C, D, D) of C sets of views: those chosen already, and one of `more`.
+
+        D = m (number chosen + 1).
+
+        Args:
+            chosen: indices of views that are in every set.
+            more: (C,) index of the last view of each set.
+        """
+        sets = np.column_stack([np.tile(np.array(chosen, np.int64), (len(more), 1)), more])
+        C, k = sets.shape
         m = self.mean.shape[1]
-        roots = self.unknown[stacks].reshape(C, k * m, -1)
+        roots = self.coefficient_root[sets].reshape(C, k * m, -1)
         covariance = roots @ roots.transpose(0, 2, 1)
+        # The same memory by views: what is added to the blocks is added to the covariance.
         blocks = covariance.reshape(C, k, m, k, m)
         if self.shared is not None:
-            blocks += self.shared[stacks[:, :, None], :, stacks[:, None, :]].transpose(0, 1, 3, 2, 4)
+            blocks += self.shared[sets[:, :, None], :, sets[:, None, :]].transpose(0, 1, 3, 2, 4)
         each = np.arange(k)
-        blocks[:, each, :, each] += self.own[stacks].transpose(1, 0, 2, 3)
-        return self.mean[stacks].reshape(C, k * m), covariance
+        blocks[:, each, :, each] += self.per_view[sets].transpose(1, 0, 2, 3)
+        return self.mean[sets].reshape(C, k * m), covariance
 
 
 def deciding_views(
@@ -115,11 +123,14 @@ def deciding_views(
 ) -> DecidingViews | None:
     """Return the further views after which one of the rivals is most likely named; None where no pose tells them apart.
 
-    Poses within reach, near those driven, from which the scanner sees the part as it has before.
+    Views are chosen among poses near those driven, from which the scanner sees the part as it has before; then again
+    among the best of these and poses close to them.
 
     Args:
-        undecided: so many rivals, the first, are held undecided by a verdict. Where the evidence so far would have
-            decided between them, it did not count there: then they are taken for equally likely.
+        rivals: effects, as they are ranked beside each other.
+        most: number of views at the most.
+        undecided: number of rivals, the first ones, between which the verdict did not decide. Where their evidence
+            would have decided, the verdict overruled it: then they are taken for equally likely.
     """
     scores = [ranked.score for ranked in rivals]
     if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
@@ -139,48 +150,52 @@ def deciding_views(
     if not len(joints):
         return None
     forms = competing_forms(scores, log_weights, [ranked.log_belief for ranked in rivals], unnamed)
-    first, single = _choose(linear, forms, joints, most)
-    best = joints[np.argsort(-single, kind="stable")[:_BEST]]
-    closer = possible_joints(linear, best)[:_CLOSER]
-    both = np.concatenate([best, first.joints, closer])
-    views, _ = _choose(linear, forms, np.unique(both.round(9), axis=0), most)
+    first, share_alone = _choose(linear, forms, joints, most)
+    best = joints[np.argsort(-share_alone, kind="stable")[:_BEST]]
+    close_to_best = possible_joints(linear, best)[:_CLOSE_TO_BEST]
+    refined = np.concatenate([best, first.joints, close_to_best])
+    views, _ = _choose(linear, forms, np.unique(refined.round(9), axis=0), most)
     return views if len(views.joints) else None
 
 
 def unnamed_joints(linear: LinearModel, scores: Sequence[Score]) -> list[tuple[JointEffect, float]]:
-    """Return what single joints may do that follow the pose by no known law, beside none of the rivals, the likeliest
-    with their log posteriors; [] where the views tell of none."""
+    """Return the likeliest unmodelled effects of single joints that follow the pose, each with its log posterior.
+
+    They are scored in the model without random effects of the rivals' names, as the rivals are. [] where the views tell
+    of none.
+    """
     base = linear.without([scored.name for scored in scores])
     effects = joint_effects(base)
-    followed = [effect for effect in effects if effect.follows in _BY_POSE][:_FORMS]
-    factors = np.array([effect.log_bayes_factor for effect in followed])
-    shares = log_posterior_of_any(factors[None]) - np.log(max(len(effects), 1))
-    return [each for each in zip(followed, shares.tolist(), strict=True) if each[1] > shares.max() - _NEAR_FORMS]
+    by_pose = [effect for effect in effects if effect.follows in _BY_POSE][:_FORMS]
+    factors = np.array([effect.log_bayes_factor for effect in by_pose])
+    # Each has its share of the prior of all effects of joints.
+    posteriors = log_posterior_of_any(factors[None]) - np.log(max(len(effects), 1))
+    pairs = zip(by_pose, posteriors.tolist(), strict=True)
+    return [(effect, posterior) for effect, posterior in pairs if posterior > posteriors.max() - _BEHIND_BEST]
 
 
 @dataclass(frozen=True)
 class RivalForms:
-    """Forms of all rivals, each as a score of its own; the last rival may be a joint without a law."""
+    """F forms of all R rivals, each as a score of its own; the last rival may be a joint without a law."""
 
     scores: list[Score | JointEffect]
-    log_weights: Array  # (F,) not normalised
-    rival: Indices  # (F,) whose form it is
+    log_weights: Array  # (F,) log posterior by the views taken, not normalised
+    rival: Indices  # (F,) index of the rival whose form it is
     log_belief: Array  # (R,) how often each rival is met, a judgement that decides nothing by itself
-    named: int  # so many rivals, the first, have a name
+    named: int  # number of rivals that have a name, the first ones
 
-    def margins(self, fits: Array) -> Array:
-        """Return (R, …) by how much each rival is ahead of all others, from log posteriors (R, …) of all.
+    def margins(self, log_posteriors: Array) -> Array:
+        """Return (R, …) by how many nats each rival is ahead of the nearest other one, from log posteriors (R, …).
 
-        Ahead by what the views say, and by that and what is believed.
+        A rival that is met more rarely has to be ahead by that too; one that is met more often gains nothing by it.
         """
-        others = [np.delete(np.arange(len(fits)), r) for r in range(len(fits))]
-        held = [np.minimum(self.log_belief[r] - self.log_belief[some], 0.0) for r, some in enumerate(others)]
-        return np.array(
-            [
-                (fits[r] - fits[some] + held[r].reshape(-1, *[1] * (fits.ndim - 1))).min(axis=0)
-                for r, some in enumerate(others)
-            ]
-        )
+        margins = list[Array]()
+        for r, log_posterior in enumerate(log_posteriors):
+            others = np.delete(np.arange(len(log_posteriors)), r)
+            handicap = np.minimum(self.log_belief[r] - self.log_belief[others], 0.0)
+            by_other = handicap.reshape(-1, *[1] * log_posterior.ndim)
+            margins.append((log_posterior - log_posteriors[others] + by_other).min(axis=0))
+        return np.array(margins)
 
 
 def competing_forms(
@@ -189,23 +204,25 @@ def competing_forms(
     log_belief: Sequence[float] = (),
     unnamed: Sequence[tuple[JointEffect, float]] = (),
 ) -> RivalForms:
-    """Return the likeliest forms of each rival, which share its weight (R,), and of joints without a law as one more.
+    """Return the likeliest forms of each rival, and the joints without a law as the forms of one more rival.
 
     Args:
-        log_belief: of each rival; () where all are met alike.
+        scores: of the rivals that have a name.
+        log_weights: (R,) of these, not normalised; the forms of a rival share its weight.
+        log_belief: (R,) how often each is met; () where all are met alike.
+        unnamed: effects of single joints with their weights.
     """
     forms = list[Score | JointEffect]()
     weights = list[float]()
     rival = list[int]()
     for r, scored in enumerate(scores):
-        every, shares = scored.candidate.forms, scored.log_shares
+        of_rival, shares = scored.candidate.forms, scored.log_shares
         if shares is None:
-            every, shares = (scored.form,), np.zeros(1)
+            of_rival, shares = (scored.form,), np.zeros(1)
         likeliest = np.argsort(-shares, kind="stable")[:_FORMS]
-        kept = [i for i in likeliest if shares[i] > shares.max() - _NEAR_FORMS and every[i].columns.any()]
-        of_rival = log_weights[r] + shares[kept] - np.logaddexp.reduce(shares[kept])
-        forms += [replace(scored, form=every[i]) for i in kept]
-        weights += of_rival.tolist()
+        kept = [i for i in likeliest if shares[i] > shares.max() - _BEHIND_BEST and of_rival[i].columns.any()]
+        forms += [replace(scored, form=of_rival[i]) for i in kept]
+        weights += (log_weights[r] + shares[kept] - np.logaddexp.reduce(shares[kept])).tolist()
         rival += [r] * len(kept)
     forms += [effect for effect, _ in unnamed]
     weights += [weight for _, weight in unnamed]
@@ -216,73 +233,95 @@ def competing_forms(
 
 
 def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> tuple[DecidingViews, Array]:
-    """Return the views that are chosen one after the other among joints (N, n), and (N,) the mean probability of the
-    true rival after each alone."""
+    """Return the views that decide best, chosen one after the other, and how much each view decides alone.
+
+    The measure is the probability that the true rival will have, on average over what the view may show. Choosing ends
+    when the true rival will be named with probability `SURE`, or when a further view adds less than `_WORTH`.
+
+    Args:
+        joints: (N, n) rad, of the views to choose from.
+        most: number of views at the most.
+
+    Returns:
+        The views; and (N,) the measure after each view alone.
+    """
     wait = _waits(linear, forms.scores, len(joints))
     predictions = predict_views(linear, forms.scores, joints, wait)
     m = predictions[0].mean.shape[1]
-    every: Indices = np.arange(len(joints), dtype=np.int64)
+    indices: Indices = np.arange(len(joints), dtype=np.int64)
     rng = np.random.default_rng(0)
     weights = np.exp(forms.log_weights - forms.log_weights.max())
+    # Before any further view: a rival is the true one with its share, and has that share then.
     true_share = float(np.sum((np.bincount(forms.rival, weights) / weights.sum()) ** 2))
     chosen = list[int]()
     probability = list[float]()
-    single = np.zeros(len(joints))
+    share_alone = np.zeros(len(joints))
     while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
-        of_true = _decisions(predictions, forms, chosen, every, draws)[2]
-        of_true[chosen] = -1.0
+        shares = _decisions(predictions, forms, chosen, indices, draws)[2]
+        shares[chosen] = -1.0
         if not chosen:
-            single = of_true
-        k = int(of_true.argmax())
-        stated = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
-        right, _, share = _decisions(predictions, forms, chosen, every[k : k + 1], stated)
+            share_alone = shares
+        k = int(shares.argmax())
+        more_draws = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
+        right, _, share = _decisions(predictions, forms, chosen, indices[k : k + 1], more_draws)
         if share[0] < true_share + _WORTH:
             break
         chosen.append(k)
         probability.append(float(right[0]))
         true_share = float(share[0])
-    return DecidingViews(joints[chosen], wait[chosen], np.array(probability)), single
+    return DecidingViews(joints[chosen], wait[chosen], np.array(probability)), share_alone
 
 
 def _decisions(
     predictions: Sequence[Prediction], forms: RivalForms, chosen: Sequence[int], more: Indices, draws: Array
 ) -> tuple[Array, Array, Array]:
-    """Return for each of `more` (C,) the probabilities that the true rival is named after it, that a wrong one is, and
-    the mean probability of the true one.
+    """Return what will be decided after the chosen views and one of `more` (C,), by simulation: three arrays (C,).
+
+    They are the probability that the true rival is named, the probability that a wrong one is, and the mean posterior
+    probability of the true one. Each form in turn is taken for the true one, as often as its weight says.
 
     Args:
-        draws: (S, D) standard normal numbers, the same for all.
+        draws: (S, D) standard normal numbers, from which what the views show is drawn.
     """
-    parts = [prediction.of(chosen, more) for prediction in predictions]
-    halves = [np.linalg.cholesky(covariance) for _, covariance in parts]
-    inverses = [np.linalg.inv(half) for half in halves]
-    sizes = [np.log(np.diagonal(half, axis1=1, axis2=2)).sum(axis=1) for half in halves]
+    moments = [prediction.of(chosen, more) for prediction in predictions]
+    roots = [np.linalg.cholesky(covariance) for _, covariance in moments]
+    inverses = [np.linalg.inv(root) for root in roots]
+    # Half the log determinants of the covariances.
+    log_dets = [np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) for root in roots]
     weights = np.exp(forms.log_weights - forms.log_weights.max())
     weights = weights / weights.sum()
     rivals = range(int(forms.rival.max()) + 1)
     right, wrong, share = np.zeros((3, len(more)))
-    for weight, true, (mean, _), half in zip(weights, forms.rival, parts, halves, strict=True):
-        seen = mean[:, None] + draws @ half.transpose(0, 2, 1)
+    for weight, true, (true_mean, _), root in zip(weights, forms.rival, moments, roots, strict=True):
+        observed = true_mean[:, None] + draws @ root.transpose(0, 2, 1)
         of_forms = np.array(
             [
                 log_weight
-                - size[:, None]
-                - 0.5 * np.sum(((seen - other[:, None]) @ back.transpose(0, 2, 1)) ** 2, axis=2)
-                for log_weight, size, (other, _), back in zip(forms.log_weights, sizes, parts, inverses, strict=True)
+                - log_det[:, None]
+                - 0.5 * np.sum(((observed - mean[:, None]) @ inverse.transpose(0, 2, 1)) ** 2, axis=2)
+                for log_weight, log_det, (mean, _), inverse in zip(
+                    forms.log_weights, log_dets, moments, inverses, strict=True
+                )
             ]
         )
-        fits = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
-        decided = forms.margins(fits) > ODDS
+        log_posteriors = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
+        decided = forms.margins(log_posteriors) > ODDS
         right += weight * decided[true].mean(axis=1)
         others = [r for r in range(forms.named) if r != true]
         wrong += weight * decided[others].any(axis=0).mean(axis=1)
-        share += weight * np.exp(fits[true] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
+        share += weight * np.exp(log_posteriors[true] - np.logaddexp.reduce(log_posteriors, axis=0)).mean(axis=1)
     return right, wrong, share
 
 
 def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
-    """Return (K, n) joint angles, rad, near those driven, or closer to chosen ones, from which the part is seen."""
+    """Return random joint angles (K, n), rad, from which the scanner sees the part as it has before.
+
+    Of labelled points what is seen is not asked.
+
+    Args:
+        chosen: (C, n) rad, angles to stay close to; None: those of the views taken.
+    """
     driven = linear.measurement.views.joints
     observation = linear.observation
     if not isinstance(observation, SurfaceObservation):
@@ -294,40 +333,45 @@ def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
         T = forward(linear.measurement.robot, joints)
         return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
 
-    seen_from = observation.capture.poses(T_mount)
-    least = _LEAST_SEEN * np.median(seen_shares(observation, seen_from, seen_from))
-    found = np.zeros((0, driven.shape[1]))
+    scan_poses = observation.capture.poses(T_mount)
+    least = _LEAST_SEEN * np.median(seen_shares(observation, scan_poses, scan_poses))
+    possible = np.zeros((0, driven.shape[1]))
     for seed in range(_SEARCHES):
-        joints = reachable(driven, poses_of, seen_from, observation.centre, chosen, seed)
-        joints = joints[seen_shares(observation, seen_from, poses_of(joints)) > least] if len(joints) else joints
-        found = np.concatenate([found, joints])
-        if len(found) >= _TRIED:
+        joints = reachable(driven, poses_of, scan_poses, observation.centre, chosen, seed)
+        joints = joints[seen_shares(observation, scan_poses, poses_of(joints)) > least] if len(joints) else joints
+        possible = np.concatenate([possible, joints])
+        if len(possible) >= _TRIED:
             break
-    return found
+    return possible
 
 
-def seen_shares(observation: SurfaceObservation, seen_from: Array, poses: Array) -> Array:
-    """Return (K,) share of the scanned surface that faces the scanner, within its field, at poses (K, 4, 4).
+def seen_shares(observation: SurfaceObservation, scan_poses: Array, poses: Array) -> Array:
+    """Return (K,) the share of the scanned surface that faces the scanner, within its field, at poses (K, 4, 4).
+
+    The field is the common box of all scans, scanner frame. About `_POINTS` points of the scans stand for the surface.
 
     Args:
-        seen_from: T_reference_scanner (V, 4, 4) of the scans.
+        scan_poses: T_reference_scanner (V, 4, 4) of the scans.
+        poses: T_reference_scanner (K, 4, 4) that are asked.
     """
     scans = observation.capture.scans
-    of_each = [np.linspace(0, len(scan.points) - 1, max(_POINTS // len(scans), 1)).astype(int) for scan in scans]
-    some = list(zip(seen_from, scans, of_each, strict=True))
-    points = np.concatenate([frames.transform(T, scan.points[i]) for T, scan, i in some])
-    normals = np.concatenate([scan.normals[i] @ T[:3, :3].T for T, scan, i in some])
+    per_scan = max(_POINTS // len(scans), 1)
+    sampled = [np.linspace(0, len(scan.points) - 1, per_scan).astype(int) for scan in scans]
+    posed = list(zip(scan_poses, scans, sampled, strict=True))
+    points = np.concatenate([frames.transform(T, scan.points[i]) for T, scan, i in posed])
+    normals = np.concatenate([scan.normals[i] @ T[:3, :3].T for T, scan, i in posed])
     boxes = np.array([scan.box for scan in scans])
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    there = frames.transform(frames.inverse(poses), points)
-    sight = some[0][1].eye - there
-    facing = np.einsum("kmi,kmi->km", normals @ poses[:, :3, :3], sight) > _FACING * np.linalg.norm(sight, axis=2)
-    return np.asarray((facing & (there > low).all(axis=2) & (there < high).all(axis=2)).mean(axis=1))
+    in_scanner = frames.transform(frames.inverse(poses), points)
+    to_eye = scans[0].eye - in_scanner
+    facing = np.einsum("kmi,kmi->km", normals @ poses[:, :3, :3], to_eye) > _FACING * np.linalg.norm(to_eye, axis=2)
+    in_field = (in_scanner > low).all(axis=2) & (in_scanner < high).all(axis=2)
+    return np.asarray((facing & in_field).mean(axis=1))
 
 
 def _waits(linear: LinearModel, scores: Sequence[Score | JointEffect], count: int) -> Array:
-    """Return (N,) s that one waits before each view; none where no rival goes with time."""
+    """Return (N,) s to wait before each view, `_WAITS` in turn; zero where no rival goes with time."""
     views = linear.measurement.views
     effects = [scored.candidate.effect for scored in scores if isinstance(scored, Score)]
     with_time = any("time" in effect.needs or "time" in effect.prefers for effect in effects)
@@ -340,7 +384,13 @@ def _waits(linear: LinearModel, scores: Sequence[Score | JointEffect], count: in
 def predict_views(
     linear: LinearModel, scores: Sequence[Score | JointEffect], joints: Array, wait: Array
 ) -> list[Prediction]:
-    """Return what each rival expects of views at joints (N, n)."""
+    """Return each rival's prediction of N further views: twists of surfaces, or reduced numbers of labelled points.
+
+    Args:
+        scores: of the rivals.
+        joints: (N, n) rad.
+        wait: (N,) s before each view, beside the usual pause.
+    """
     match linear.observation:
         case SurfaceObservation() as surfaces:
             further = _FurtherScans.of(linear, surfaces, joints, wait)
@@ -353,42 +403,42 @@ def predict_views(
 
 @dataclass(frozen=True)
 class _FurtherScans:
-    """V views of surfaces and N further ones."""
+    """V views of surfaces that were taken, and N further ones."""
 
     surfaces: SurfaceObservation
-    measurement: Measurement  # of V + N
-    errors: PoseErrors | None  # of their twists, not reduced
-    flange: Array  # (V + N, 6, 6) adjoint of the flange
+    measurement: Measurement  # of all V + N views
+    errors: PoseErrors | None  # of all their twists, not reduced; None: no prior
+    flange: Array  # (V + N, 6, 6) adjoints: from a twist of the flange to the view's about the surface's centre
 
     @classmethod
     def of(cls, linear: LinearModel, surfaces: SurfaceObservation, joints: Array, wait: Array) -> "_FurtherScans":
         """Return further views at joint angles (N, J), rad, after waits (N,), s, beside those of a linear model."""
         further = candidate_measurement(linear.measurement, joints, wait)
-        every = with_candidates(linear.measurement, further)
+        both = with_candidates(linear.measurement, further)
         errors = None
         if linear.pose_errors is not None:
-            errors = prior_pose_errors([every], linear.model, [surfaces.centre])
-            errors = _with_drift(errors, every, linear.measurement, surfaces.centre)
+            errors = prior_pose_errors([both], linear.model, [surfaces.centre])
+            errors = _with_drift(errors, both, linear.measurement, surfaces.centre)
         to_centre = frames.make(np.eye(3), -surfaces.centre)
-        flange = frames.adjoint(to_centre @ every.capture.T_reference_flange)
-        return cls(surfaces, every, errors, flange)
+        flange = frames.adjoint(to_centre @ both.capture.T_reference_flange)
+        return cls(surfaces, both, errors, flange)
 
     @property
-    def before(self) -> int:
-        """6V numbers of the views that there are."""
+    def taken_rows(self) -> int:
+        """6V, the number of rows of the views that were taken."""
         return len(self.surfaces.reduced_poses.reduction[0])
 
-    def further(self, columns: Array) -> Array:
-        """(6N, P) of the further views, less the mean motion (6, P) of the others, of columns (6 (V + N), P)."""
-        mean = columns[: self.before].reshape(-1, 6, columns.shape[1]).mean(axis=0)
-        return columns[self.before :] - np.tile(mean, ((len(columns) - self.before) // 6, 1))
+    def relative(self, columns: Array) -> Array:
+        """Return the twists (6N, P) of further views less the mean of those taken, from all of them (6 (V + N), P)."""
+        mean = columns[: self.taken_rows].reshape(-1, 6, columns.shape[1]).mean(axis=0)
+        return columns[self.taken_rows :] - np.tile(mean, ((len(columns) - self.taken_rows) // 6, 1))
 
     def covariance(self, base: LinearModel, unnamed: JointEffect | None) -> Array:
-        """Return the covariance (6 (V + N), 6 (V + N)) of the twists of V views and N further ones by errors of poses.
+        """Return the covariance (6 (V + N), 6 (V + N)) of the twists of all views by pose errors and scatter.
 
         Args:
-            base: whose variances they have.
-            unnamed: a joint that errs by no known law beside them.
+            base: the model with their variances.
+            unnamed: a joint without a law whose errors are among them, the last variance; None: none is.
         """
         variances = base.null.variances
         n = 6 * len(self.flange)
@@ -405,29 +455,35 @@ class _FurtherScans:
         return out
 
     def _of_joint(self, unnamed: JointEffect) -> Array:
-        """(6 (V + N), 6 (V + N)) of the twists by a joint without a law, of unit variance."""
+        """Return the covariance (6 (V + N), 6 (V + N)) of all twists by a joint without a law.
+
+        Its random function, of variance 1, is found again among those of all views by the joints that it follows.
+        """
         assert self.errors is not None
-        here, every = unnamed.errors, self.errors.joint_processes[unnamed.follows]
-        own = here.joints[unnamed.process], here.others[unnamed.process] if here.others else None
-        same = list(zip(every.joints, every.others or (None,) * len(every.joints), strict=True)).index(own)
-        return every.twist_covariance(same)
+        of_taken, of_all = unnamed.errors, self.errors.joint_processes[unnamed.follows]
+        joints = of_taken.joints[unnamed.process], of_taken.others[unnamed.process] if of_taken.others else None
+        pairs = list(zip(of_all.joints, of_all.others or (None,) * len(of_all.joints), strict=True))
+        return of_all.twist_covariance(pairs.index(joints))
 
     def noise(self, base: LinearModel) -> Array:
-        """Return the covariance (6, 6) of a further view's twist by noise of the surfaces: the mean of those so far."""
+        """Return the covariance (6, 6) of a further view's twist by noise of the surfaces: the mean of views taken."""
         expansion = self.surfaces.reduced_poses.expansion
         noise = base.mixed.components[NOISE, 0] * base.null.variances[NOISE]
         if base.mixed.fixed is not None:
             noise = noise + base.mixed.fixed[0]
-        blocks = (expansion @ noise @ expansion.T).reshape(-1, 6, self.before // 6, 6)
+        blocks = (expansion @ noise @ expansion.T).reshape(-1, 6, self.taken_rows // 6, 6)
         each = np.arange(len(blocks))
         return np.asarray(blocks[each, :, each].mean(axis=0))
 
 
-def _with_drift(errors: PoseErrors, every: Measurement, before: Measurement, centre: Array) -> PoseErrors:
-    """Return the errors with what wanders counted in the steps of the views that there are."""
-    step = usual_time_step(before)
-    time = every.views.time / step if step > 0 else every.views.number.astype(float)
-    flange = flange_twists([every], [centre])
+def _with_drift(errors: PoseErrors, both: Measurement, taken: Measurement, centre: Array) -> PoseErrors:
+    """Return the pose errors of all views with drift that counts time in the usual steps of the views taken.
+
+    Their own steps would be others, since further views are all taken at the end.
+    """
+    step = usual_time_step(taken)
+    time = both.views.time / step if step > 0 else both.views.number.astype(float)
+    flange = flange_twists([both], [centre])
     components = errors.components.copy()
     for name, memory in DRIFT_MEMORY.items():
         components[errors.names.index(name)] = process_covariance(flange, exponential_kernel(time, time, memory))
@@ -435,39 +491,36 @@ def _with_drift(errors: PoseErrors, every: Measurement, before: Measurement, cen
 
 
 def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _FurtherScans) -> Prediction:
-    """Return what further views would show of their poses if an effect, as these views fit it, were there.
+    """Return a rival's prediction of the poses of further views: left twists about the surface's centre, m = 6.
 
     Args:
-        scored: the effect, or a joint that errs without a name.
-        scans: the further views, beside those that there are.
-
-    Returns:
-        Mean (N, 6) of the left twists of the further views about the centre, how it answers to what is unknown,
-        covariance that the views share, that of each alone, and how they answer to hand-eye and effects in use.
+        scored: the rival: an effect as the views taken fit it, or a joint without a law.
+        scans: the further views, beside those taken.
     """
     unnamed = scored if isinstance(scored, JointEffect) else None
     base = scored.model if isinstance(scored, JointEffect) else model_beside(linear, scored)
     measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre
     hand_eye = hand_eye_jacobian(measurement.capture.hand_eye_frames(bare.T_mount), centre)
-    every = [hand_eye, _used_columns(linear, scans)]
+    all_columns = [hand_eye, _used_columns(linear, scans)]
     if isinstance(scored, Score):
-        every.append(_twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep])
-    columns = scans.further(np.hstack(every))
+        all_columns.append(_twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep])
+    columns = scans.relative(np.hstack(all_columns))
     covariance = scans.covariance(base, unnamed)
-    across = scans.further(covariance[:, : scans.before] @ scans.surfaces.reduced_poses.reduction.T)
-    together = scans.further(scans.further(covariance).T)
+    with_taken = scans.relative(covariance[:, : scans.taken_rows] @ scans.surfaces.reduced_poses.reduction.T)
+    among_further = scans.relative(scans.relative(covariance).T)
     N = len(columns) // 6
-    own = np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6))
-    mean, unknown, explained = _given_views(base, scored, columns, across)
-    shared = (together - explained).reshape(N, 6, N, 6)
+    per_view = np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6))
+    mean, root, explained = _condition_on_views(base, scored, columns, with_taken)
+    shared = (among_further - explained).reshape(N, 6, N, 6)
     design = columns[:, : base.white_design.shape[1]].reshape(N, 6, -1)
-    return Prediction(mean.reshape(N, 6), unknown.reshape(N, 6, -1), shared, own, design)
+    return Prediction(mean.reshape(N, 6), root.reshape(N, 6, -1), shared, per_view, design)
 
 
 def _used_columns(linear: LinearModel, scans: _FurtherScans) -> Array:
-    """Return how the twists of views and further ones answer to the effects in use, (6 (V + N), a − 6).
+    """Return the derivatives (6 (V + N), a − 6) of the twists of all views by the effects in use.
 
-    Columns of the fit are found again among those of each effect; further views answer only to what moves poses.
+    Columns of the fit are found again, by value, among those of each effect. Effects that change points have zeros in
+    further views: these have no points.
     """
     design = linear.design[:, 6:]
     out = np.vstack([design, np.zeros((6 * len(scans.flange) - len(design), design.shape[1]))])
@@ -476,75 +529,81 @@ def _used_columns(linear: LinearModel, scans: _FurtherScans) -> Array:
             continue
         twists = _twists(scans.measurement, linear.model, term, scans.surfaces.centre)
         for j, column in enumerate(design.T):
-            off = np.linalg.norm(twists[: len(design)] - column[:, None], axis=0)
-            if len(off) and off.min() < 1e-6 * np.linalg.norm(column):
-                out[:, j] = twists[:, off.argmin()]
+            distance = np.linalg.norm(twists[: len(design)] - column[:, None], axis=0)
+            if len(distance) and distance.min() < 1e-6 * np.linalg.norm(column):
+                out[:, j] = twists[:, distance.argmin()]
     return out
 
 
 def _twists(measurement: Measurement, model: Model, term: Term, centre: Array) -> Array:
-    """(6V, P) twists of all views per unit of each parameter of a term."""
+    """Return the twists (6V, P) of all views per unit of each parameter of a term, about a centre (3,)."""
     derivative = next(pose_derivatives(measurement, model, [term], centre))
     return derivative.reshape(len(derivative), -1).T
 
 
-def _given_views(
-    base: LinearModel, scored: Score | JointEffect, columns: Array, across: Array
+def _condition_on_views(
+    base: LinearModel, scored: Score | JointEffect, columns: Array, with_taken: Array
 ) -> tuple[Array, Array, Array]:
-    """Return mean (M,) of further numbers given those that were seen, the root (M, q) of what is not known of the
-    coefficients, and the covariance (M, M) that the seen ones explain.
+    """Return the distribution of M further numbers given the views taken, for a linear model with coefficients.
+
+    It is the mean (M,), a root (M, q) of the covariance by the coefficients' uncertainty, and the covariance (M, M) by
+    pose errors that the views taken explain (Rasmussen & Williams 2006, eq. 2.42).
 
     Args:
         columns: (M, q) of the further numbers: hand-eye and effects in use, then the rival's parameters.
-        across: (M, n) covariance with the reduced observations.
+        with_taken: (M, n) their covariance with the reduced observations.
     """
     white, precision = base.white_design, np.zeros(base.white_design.shape[1])
     if isinstance(scored, Score):
         # A rival is of plausible size, or as much larger as it seems to be.
         white = np.column_stack([white, base.whiten(scored.form.columns)])
         precision = np.append(precision, (scored.scale * scored.form.sizes) ** -2.0)
-    seen = base.whiten(np.ascontiguousarray(across.T))
+    white_covariance = base.whiten(np.ascontiguousarray(with_taken.T))
     normal, unit = equilibrated(white.T @ white + np.diag(precision))
     values, vectors = np.linalg.eigh(normal)
     root = unit[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
     coefficients = root @ (root.T @ (white.T @ base.white_z))
-    mean = columns @ coefficients + seen.T @ (base.white_z - white @ coefficients)
-    return mean, (columns - seen.T @ white) @ root, seen.T @ seen
+    mean = columns @ coefficients + white_covariance.T @ (base.white_z - white @ coefficients)
+    return mean, (columns - white_covariance.T @ white) @ root, white_covariance.T @ white_covariance
 
 
 def _predict_targets(
     linear: LinearModel, observation: ReducedRows, scores: Sequence[Score], joints: Array, wait: Array
 ) -> list[Prediction]:
-    """Return what rivals expect where all targets are seen, in numbers that a motion of the view or a rival moves.
+    """Return the rivals' predictions of further views that see all targets, whose errors are independent.
 
-    Beside a rival views err independently.
+    The residuals of a view are reduced to the numbers that a motion of the view, or a rival, can change.
     """
     targets = observation.rows
     assert isinstance(targets, TargetRows)
     measurement = candidate_measurement(linear.measurement, joints, wait)
     rows, columns = candidate_rows(measurement, targets, targets.places, [zero_term(scored) for scored in scores])
-    within = [moved for scored, moved in zip(scores, columns, strict=True) if moves_points([scored.form.term])]
+    by_point = [moved for scored, moved in zip(scores, columns, strict=True) if moves_points([scored.form.term])]
     per_sigma = np.where(rows.noise > 0, rows.noise, np.inf) ** -0.5
-    turn = pose_numbers(per_sigma[..., None] * np.concatenate([rows.lever, *within], axis=2)) * per_sigma[:, None]
-    placed = rows.landmarks @ observation.reduction.kept
-    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - placed.shape[2]))
-    scattered = [turn @ moved for moved in rows.scattered]
+    reduction = (
+        pose_numbers(per_sigma[..., None] * np.concatenate([rows.lever, *by_point], axis=2)) * per_sigma[:, None]
+    )
+    landmarks = rows.landmarks @ observation.reduction.kept
+    # Effects in use stay as they are: their columns are zero.
+    in_use = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - landmarks.shape[2]))
+    scattered = [reduction @ moved for moved in rows.scattered]
     predictions = []
     for scored, moved in zip(scores, columns, strict=True):
         base = model_beside(linear, scored)
-        every = turn @ np.concatenate([rows.hand_eye, placed, extra, moved[..., scored.form.keep]], axis=2)
-        N, d, q = every.shape
-        mean, unknown, _ = _given_views(base, scored, every.reshape(-1, q), np.zeros((N * d, len(base.white_z))))
-        own = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
+        reduced = reduction @ np.concatenate([rows.hand_eye, landmarks, in_use, moved[..., scored.form.keep]], axis=2)
+        N, d, q = reduced.shape
+        with_taken = np.zeros((N * d, len(base.white_z)))
+        mean, root, _ = _condition_on_views(base, scored, reduced.reshape(-1, q), with_taken)
+        per_view = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
         for variance, of_flange in zip(base.flange_scatter(base.null), scattered, strict=True):
-            own += variance * (of_flange @ of_flange.transpose(0, 2, 1))
-        design = every[..., : base.white_design.shape[1]]
-        predictions.append(Prediction(mean.reshape(N, d), unknown.reshape(N, d, -1), None, own, design))
+            per_view += variance * (of_flange @ of_flange.transpose(0, 2, 1))
+        design = reduced[..., : base.white_design.shape[1]]
+        predictions.append(Prediction(mean.reshape(N, d), root.reshape(N, d, -1), None, per_view, design))
     return predictions
 
 
 def model_beside(linear: LinearModel, scored: Score) -> LinearModel:
-    """Return the model with the variances that are left beside a candidate."""
+    """Return the model in which a candidate was scored, with the variances that were fitted beside the candidate."""
     if scored.base_model is not None or scored.variances is None:
         return scored.base_model or linear
     base = linear.without([scored.name])
@@ -552,5 +611,5 @@ def model_beside(linear: LinearModel, scored: Score) -> LinearModel:
 
 
 def zero_term(scored: Score) -> Term:
-    """Return the candidate's best form at zero."""
+    """Return the term of the candidate's best form, its free parameters at zero."""
     return scored.form.at(np.zeros(len(scored.form.sizes)))

@@ -36,7 +36,7 @@ _REFITTED, _FEW_NUMBERS, _REFITTED_OF_MANY = 12, 400, 3
 
 @dataclass(frozen=True)
 class Dependence:
-    """One covariate, by the law that explains most of the displacements; bins along the direction that follows it."""
+    """How the views' displacement follows one covariate, by the law that explains most of it, with means over bins."""
 
     covariate: str
     unit: str
@@ -68,7 +68,7 @@ def equally_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
 
 
 def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
-    """Return those that are clear beside the clearest too."""
+    """Return the dependences that are clear by themselves and beside the clearest one."""
     return tuple(x for x in followed if x.clear and x.p_beside < FOLLOWS)
 
 
@@ -86,11 +86,11 @@ def dependences(
     """
     # Poses scatter independently here: random effects of joints would absorb what is sought.
     linear = linear.restricted(())
-    laws = [law for law in (dictionary or dictionary_of(linear)).laws if law.is_whole]
+    laws = [law for law in (dictionary or dictionary_of(linear)).laws if law.is_full]
     if not laws:
         return ()
     clearest = _may_be_clearest(linear, laws)
-    columns = {k: laws[k].reduced(linear.observation) * laws[k].sizes for k in clearest}
+    columns = {k: laws[k].reduced_columns(linear.observation) * laws[k].sizes for k in clearest}
     p_values = np.ones(len(laws))
     p_values[clearest] = _p_values(linear, list(columns.values()))
     twins = _twins_of_followed(linear, laws, named)
@@ -100,9 +100,8 @@ def dependences(
         if laws[k].driver.name not in twins:
             best.setdefault(laws[k].driver.covariate, k)
     first, *others = best.values()
-    beside = dict(
-        zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
-    )
+    beside_first = _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others])
+    beside = dict(zip(others, beside_first, strict=True))
     displacement = linear.view_displacements()
     tried = len(laws)  # Bonferroni: each law was chosen among all
     return tuple(
@@ -121,7 +120,7 @@ def _may_be_clearest(linear: LinearModel, laws: Sequence[Law]) -> list[int]:
     by_driver: dict[str, list[tuple[float, int]]] = {}
     for place, shapes, index in stacked(laws):
         sizes = laws[index[0, 0]].sizes
-        information, vector = linear.information_of_motions(place.twists[:, :, place.whole], shapes)
+        information, vector = linear.information_of_motions(place.twists[:, :, place.independent], shapes)
         values, vectors = np.linalg.eigh(information * np.outer(sizes, sizes))
         seen = values > _NEW_SHARE**2 * np.maximum(values[:, -1:], _NOTHING)
         explained = np.einsum("sij,si->sj", vectors, vector * sizes) ** 2 / np.where(seen, values, np.inf)
@@ -152,7 +151,7 @@ def _twins_of_followed(linear: LinearModel, laws: Sequence[Law], named: Sequence
         if has_twin[law.driver.name]
         # A joint follows columns of its own alone: j2_torque_nm.
         if law.place.joint is None or law.driver.name.startswith(f"j{law.place.joint}_")
-        if any(span.contains(Span(law.reduced(linear.observation) * law.sizes)) for span in named_spans)
+        if any(span.contains(Span(law.reduced_columns(linear.observation) * law.sizes)) for span in named_spans)
     }
     rest = {name: x for name, x in covariates.items() if name not in followed}
     return {name for name, x in rest.items() if any(abs(np.corrcoef(x, y)[0, 1]) > full for y in followed.values())}
@@ -189,16 +188,16 @@ def _p_value(linear: LinearModel, columns: Array) -> float:
 def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
     """Return the linear model with columns (n, k) as further unknowns of any size, its variances fitted again.
 
-    Only combinations that are new beside the model are added: the others would make it singular.
+    Only combinations of the columns that are new beside the model are added: others would make it singular.
     """
     white = linear.residual(columns)
     length = np.linalg.norm(white, axis=0)
     # What rounding leaves of a column that the model has already would be blown up beyond all numbers.
     new = length > _NOTHING
     columns, white, length = columns[:, new], white[:, new], length[new]
-    _, s, turned = np.linalg.svd(white / length, full_matrices=False)
+    _, s, Vt = np.linalg.svd(white / length, full_matrices=False)
     keep = s > _NEW_SHARE * s.max(initial=0.0)
-    combined = (columns / length) @ (turned[keep].T / s[keep])
+    combined = (columns / length) @ (Vt[keep].T / s[keep])
     return linear.conditioned_on(combined, np.full(int(keep.sum()), np.inf))
 
 
@@ -214,24 +213,24 @@ def _dependence(
         p_beside: the same beside the clearest covariate.
     """
     white = linear.residual(columns)
-    # What the law explains, less what a refitted hand-eye and the effects in use take up of it.
-    moved = columns @ fit_columns(white, linear.white_residual)
-    held = linear.reduce(linear.design) @ fit_columns(linear.white_design, linear.whiten(moved[:, None])[:, 0])
-    direction = np.linalg.svd(linear.observation.part_displacements(moved - held), full_matrices=False)[2][0]
+    # What the law explains, less what a refitted hand-eye and the effects in use absorb of it.
+    explained = columns @ fit_columns(white, linear.white_residual)
+    absorbed = linear.reduce(linear.design) @ fit_columns(linear.white_design, linear.whiten(explained[:, None])[:, 0])
+    direction = np.linalg.svd(linear.observation.part_displacements(explained - absorbed), full_matrices=False)[2][0]
     direction = direction * np.sign(direction[np.abs(direction).argmax()])
     along = displacement @ direction
     x = law.driver.values
     split = law.driver.name == STEP and int(np.argmax(law.shapes[:, 0] > 0))
     middle, mean, sigma = bin_means(x, along, split=float(split) - 0.5 if split else None)
-    explained = np.sum((column_space(white).T @ linear.white_residual) ** 2)
-    # What no motion of a view makes is left as well.
-    whole = float(np.sum(linear.white_residual**2)) + linear.mixed.noise_only[1] / linear.null.variances[NOISE]
+    square = np.sum((column_space(white).T @ linear.white_residual) ** 2)
+    # With the noise that no motion of a view makes.
+    total_square = float(np.sum(linear.white_residual**2)) + linear.mixed.noise_only[1] / linear.null.variances[NOISE]
     return Dependence(
         covariate=law.driver.covariate,
         unit=law.driver.unit,
         place=law.place.name,
         shape=law.shape,
-        score=float(explained / max(whole, 1e-300)),
+        score=float(square / max(total_square, 1e-300)),
         p_value=min(p_value, 1.0),
         p_beside=min(p_beside, 1.0),
         direction=direction,

@@ -91,9 +91,8 @@ class EffectTrend:
 
     def with_dots(self, dots: Indices) -> "EffectTrend":
         """Return the trend with some of its dots, by their indices."""
-        names = ("at", "views", "measured", "sigma", "predicted", "predicted_sigma", "effect", "after")
-        kept = {name: getattr(self, name) for name in names}
-        return replace(self, **{name: values[dots] for name, values in kept.items() if values is not None})
+        arrays: dict[str, Any] = {name: x[dots] for name, x in vars(self).items() if isinstance(x, np.ndarray)}
+        return replace(self, **arrays)
 
 
 def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
@@ -205,10 +204,14 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
         return None
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
-    norms = np.linalg.norm(fitted.design, axis=0)
+
     # All columns of the effect, also of parameters that the fit holds at zero: they are found in the design by value.
     of_effect = fitted.responses([term])[0].columns
-    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], of_effect, 1e-6 * norms[j])]
+    others = [
+        j
+        for j, column in enumerate(fitted.design.T)
+        if np.linalg.norm(of_effect - column[:, None], axis=0).min() > 1e-6 * np.linalg.norm(column)
+    ]
     # Observations are residuals from the model, which has the effect: its share is added back.
     observed = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
     without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=observed))
@@ -242,11 +245,6 @@ def _clearest_joint(effect: "_Effect") -> "_Effect":
     alone = np.where(of_joint | term.gridded, term.values, 0.0)
     values = np.where(clearest, change.values, 0.0)
     return replace(effect, term=term.at(alone), change=replace(change, values=values))
-
-
-def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
-    """Return whether a column (n,) is within a distance of one of several columns (n, p)."""
-    return bool((np.linalg.norm(columns - column[:, None], axis=0) <= tolerance).any())
 
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:

@@ -78,13 +78,15 @@ def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
     are in the model; else it is tested alone, as it would be added next. If the first effect fails and the second
     holds, the second is named, provided that it is certain and holds alone.
     """
-    # A score with `base_model` was made beside other effects.
     effects = _named_effects(evidence)
     alone = {r.name: r for r in evidence.ranked}
-    asked = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
-    left_out = {name: cross_validate(case.linear, scored) for name, scored in asked.items()}
+    # A score with `base_model` was made beside other effects, and is kept.
+    scores = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
+    left_out = {name: cross_validate(case.linear, scored) for name, scored in scores.items()}
+    if not effects:
+        return None
     if len(evidence.named) != 1:
-        return Reply("not asked of a group", {"left_out": left_out}) if effects else None
+        return Reply("not asked of a group", {"left_out": left_out})
     objections = list[str]()
     for effect in effects:
         objection = _objection(effect, left_out[effect.name])
@@ -131,8 +133,8 @@ def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
     pair = _pair_that_stands(case, replace(evidence, explanation=proposed.explanation))
     if pair is None:
         return Reply("no")
-    back = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
-    return Reply(f"yes, beside {pair[1].name}", {**both_missing(pair), **back})
+    not_refuted = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
+    return Reply(f"yes, beside {pair[1].name}", {**both_missing(pair), **not_refuted})
 
 
 def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
@@ -155,11 +157,12 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
         if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
         if r.log_posterior > least or not any(p.discrete for e in (r, named) for p in e.score.candidate.parameters)
     }
-    of_rivals = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
-    left_out = dict(evidence.left_out) | of_rivals
-    ahead = [name for name, validation in of_rivals.items() if validation.better_than(left_out[named.name])]
-    better = min(ahead, key=lambda name: of_rivals[name].heldout, default=named.name)
-    if better != named.name and _objection(rivals[better], of_rivals[better]) is None:
+    validations = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
+    left_out = dict(evidence.left_out) | validations
+    ahead = [name for name, validation in validations.items() if validation.better_than(left_out[named.name])]
+    better = min(ahead, key=lambda name: validations[name].heldout, default=named.name)
+    if better != named.name and _objection(rivals[better], validations[better]) is None:
+        # The better one is named instead, and the name is one of its rivals.
         rivals, named = rivals | {named.name: named}, rivals[better]
     as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
     if as_good and not case.many_views:
@@ -183,13 +186,14 @@ def is_a_likelier_effect_not_needed(case: Case, evidence: Evidence) -> Reply | N
     if any(first.name in note for note in evidence.notes):
         return Reply("what speaks against it is said")
     tests = len(evidence.ranked)
-    beside = conditioned_on_effects(case.linear, evidence.together or named)
-    again = rank_one(beside, first.score.candidate, tests)
-    if not is_certain(again):
+    with_name = conditioned_on_effects(case.linear, evidence.together or named)
+    first_beside_name = rank_one(with_name, first.score.candidate, tests)
+    if not is_certain(first_beside_name):
         return Reply(f"no: {first.name} is not")
-    other = rank_one(conditioned_on_effects(case.linear, [first]), named[0].score.candidate, tests)
-    if is_certain(other) and not case.many_views:
-        return Reply(f"both are missing: {names_of((other, again))}", both_missing((other, again)))
+    name_beside_first = rank_one(conditioned_on_effects(case.linear, [first]), named[0].score.candidate, tests)
+    if is_certain(name_beside_first) and not case.many_views:
+        pair = (name_beside_first, first_beside_name)
+        return Reply(f"both are missing: {names_of(pair)}", both_missing(pair))
     return Reply(f"yes: {first.name}", {"explanation": (*named, first), "further": None, "together": ()})
 
 
@@ -212,18 +216,17 @@ def does_the_arm_do_what_hangs_at_it(case: Case, evidence: Evidence) -> Reply | 
     if not jumps and not droops:
         return None
     pattern = linear.residual(scored.form.columns) @ scored.values
-    alike = []
+    least_share = limits.SAME_CORRELATION if jumps else limits.ALIAS_CORRELATION
+    aliases = list[Ranked]()
     for r in filter(is_contender, evidence.ranked):
         of_arm = r.score.candidate.effect.place in ARM_PLACES
         form = r.score.form if jumps else r.score.candidate.forms[0]
-        if of_arm == jumps or form.term.gridded.any() != jumps:
-            continue
-        least = limits.SAME_CORRELATION if jumps else limits.ALIAS_CORRELATION
-        if imitated_share(pattern, linear.residual(form.columns) * form.sizes) > least:
-            alike.append(r)
-    explanation = (named, *alike) if jumps else (*alike, named)
-    changes = {"explanation": explanation, "further": None, "together": ()} if alike else {}
-    return Reply(names_of(alike) or "no", changes)
+        is_of_other_kind = of_arm != jumps and form.term.gridded.any() == jumps
+        if is_of_other_kind and imitated_share(pattern, linear.residual(form.columns) * form.sizes) > least_share:
+            aliases.append(r)
+    explanation = (named, *aliases) if jumps else (*aliases, named)
+    changes = {"explanation": explanation, "further": None, "together": ()} if aliases else {}
+    return Reply(names_of(aliases) or "no", changes)
 
 
 def is_its_size_believable(case: Case, evidence: Evidence) -> Reply | None:
@@ -282,7 +285,7 @@ def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
         if law is None or effect is None:
             return None
         of_base = laws_of_base(case.linear, case.dictionary, (law,), effect.score)
-        # What has a name is told by it.
+        # A law that a named effect says is no rival of the name.
         names = {r.name for r in evidence.named}
         of_base = tuple(r for r in of_base if not names & said_by[law_of(r).key])
         return Reply(names_of(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
@@ -310,16 +313,15 @@ TESTS: tuple[Question, ...] = (
 def overlap_misfit_beyond_noise(linear: LinearModel, stated_noise: float | None = None) -> float:
     """Do the overlaps keep a misfit however the views are moved?
 
-    A seam or a ripple in the scanner's field, a corner that is off, a part that changes its shape: overlaps show it,
-    and the poses that fit best take only a share of it.
+    A seam or a ripple in the scanner's field, or a part that changes its shape, shows in overlaps, and no poses take it
+    away. The noise is the scatter about the surface within each scan (`noise_floor`), whatever a data sheet says.
 
     Args:
-        stated_noise: of the scanner, for scans too small to show their own.
+        stated_noise: of the scanner, length_unit, for scans too small to show their own.
 
     Returns:
-        Its rms (length_unit) beside the noise, where it is more than that; else 0, and where no overlap of surfaces was
-        observed. The noise is the scatter about the surface within each scan (`noise_floor`), whatever a data sheet
-        says.
+        The rms of the misfit without the noise, length_unit, where it is larger than the noise; else 0. It is 0 too
+        where no overlap of surfaces was observed.
     """
     surfaces = surfaces_of(linear)
     if surfaces is None:
@@ -354,6 +356,7 @@ def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
 
 
 def _named_effects(evidence: Evidence) -> list[Ranked]:
+    """Return the effects that are named, and the second one that is missing beside them."""
     return [r for r in (*evidence.named, evidence.second) if r is not None]
 
 
@@ -417,13 +420,15 @@ def _joints_turning_at(views: Views, first: float) -> list[int]:
     Args:
         first: number of the view at which an event begins.
     """
-    joints, after = list[int](), views.number >= first
+    joints = list[int]()
+    after = views.number >= first
     for joint, approach in enumerate(views.approach.T, 1):
-        sides = [approach[part & (approach != 0)] for part in (~after, after)]
-        if min(map(len, sides)) < _FEWEST_MOVES:
+        moves = [approach[part & (approach != 0)] for part in (~after, after)]
+        if min(map(len, moves)) < _FEWEST_MOVES:
             continue
-        # 1 where all moves go one way, −1 where all go the other.
-        before, later = (2 * np.mean(side > 0) - 1 for side in sides)
-        if before * later < 0 and min(abs(before), abs(later)) >= 2 * _ONE_WAY - 1:
+        # 1 where all moves go up, −1 where all go down.
+        before_event, after_event = (2 * np.mean(part > 0) - 1 for part in moves)
+        one_way = min(abs(before_event), abs(after_event)) >= 2 * _ONE_WAY - 1
+        if one_way and before_event * after_event < 0:
             joints.append(joint)
     return joints

@@ -43,19 +43,19 @@ from stitch.system.threads import parallel
 
 
 class Reply(NamedTuple):
-    """An answer in words, what it changes in the evidence, and whether the next questions do not arise."""
+    """What a question replies."""
 
     text: str
-    changes: Mapping[str, Any] = {}
-    ends: bool = False
+    changes: Mapping[str, Any] = {}  # fields of the evidence with their new values
+    ends: bool = False  # the questions behind it are not asked
 
 
 class Case(NamedTuple):
-    """What all questions are asked about: the views of a session, and effects that could be missing."""
+    """What all questions are asked about: the views of a session, and what could be missing in their model."""
 
     linear: LinearModel
-    candidates: Sequence[Candidate]
-    dictionary: Dictionary
+    candidates: Sequence[Candidate]  # effects
+    dictionary: Dictionary  # laws
 
     @property
     def many_views(self) -> bool:
@@ -145,14 +145,14 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         return Reply("none that could be named", ends=True)
     first = contenders[0]
     # Random effects of the arm in the model can explain what a further contender would: without those of the known
-    # contenders it may show. Each one found may reveal more.
+    # contenders it may show. Each one that shows may reveal more.
     while hidden := _hidden_contenders(case, contenders):
         contenders += hidden
     base = case.linear.without([r.name for r in contenders])
     if len(contenders) > 1 and base is not case.linear:
         # All are scored over the same null model, so that their Bayes factors compare.
         contenders = [rescored_in(base, r) for r in contenders]
-    ranked = _with_hidden(evidence.ranked, first, contenders)
+    ranked = _raise_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
     contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
@@ -239,10 +239,10 @@ def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply |
     if regime_of(case.linear).prior:
         return None  # the prior of pose errors has asked already
     best, *others = evidence.together
-    factor, trend = least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score)
-    if factor > limits.ODDS:
+    log_bayes_factor, trend = least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score)
+    if log_bayes_factor > limits.ODDS:
         return Reply("yes")
-    if factor > -limits.ODDS:
+    if log_bayes_factor > -limits.ODDS:
         return Reply(f"or {trend}", {"rival_trend": trend})
     note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views better"
     return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
@@ -293,9 +293,9 @@ NAMING: tuple[Question, ...] = (
 def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]:
     """Return contenders that show only once the random effects of the known contenders are taken out of the model.
 
-    A compliant base or an uneven gear, say, explains nothing while joints may give way by any amount. Scored again are
-    effects that are random effects of the model themselves, and the most promising of the others. Empty where the
-    model has no random effects of these names.
+    A compliant base or an uneven gear, say, explains nothing while joints may give way by any amount. Effects that are
+    random effects of the model themselves are scored again, and the most promising of the others. Empty where the model
+    has no random effects of these names.
 
     Args:
         contenders: effects that could be named already; not empty.
@@ -312,32 +312,34 @@ def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]
     return [r for r in again if is_contender(r)]
 
 
-def _with_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
-    """Return the ranking with hidden contenders at their new place; all posteriors are normalised again.
+def _raise_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
+    """Return the ranking with hidden contenders raised to their new place; all posteriors are normalised again.
 
-    Ranking and contenders were scored in different models. Differences to `first`, which is in both, are carried over.
+    Ranking and contenders were scored in different models, of which only differences compare: a hidden contender comes
+    as far behind `first` in the ranking as it does among the contenders.
 
     Args:
         ranked: all effects as they were ranked, hidden ones too low.
         first: the contender that was the likeliest there.
-        contenders: all contenders, as they are scored now.
+        contenders: all contenders, as they are scored now; `first` is among them.
     """
-    now = {r.name: r for r in contenders}
-    hidden = [now[r.name] for r in ranked if r.name in now and not is_contender(r)]
-    behind = {r.name: r.log_posterior - now[first.name].log_posterior for r in hidden}
-    for name in behind:
-        ranked = rescored_against(ranked, first, first.log_posterior + behind[name])
-    share = next(r.posterior for r in ranked if r.name == first.name)
-    beside = dict[str, Ranked]()
+    rescored = {r.name: r for r in contenders}
+    first_now = rescored[first.name]
+    hidden = [rescored[r.name] for r in ranked if r.name in rescored and not is_contender(r)]
+    differences = {r.name: r.log_posterior - first_now.log_posterior for r in hidden}
+    for difference in differences.values():
+        ranked = rescored_against(ranked, first, first.log_posterior + difference)
+    posterior = next(r.posterior for r in ranked if r.name == first.name)
+    raised = dict[str, Ranked]()
     for r in hidden:
-        less = r.score.log_bayes_factor - now[first.name].score.log_bayes_factor
-        beside[r.name] = replace(
+        gain = r.score.log_bayes_factor - first_now.score.log_bayes_factor
+        raised[r.name] = replace(
             r,
-            score=replace(r.score, log_bayes_factor=first.score.log_bayes_factor + less),
-            log_posterior=first.log_posterior + behind[r.name],
-            posterior=share * float(np.exp(behind[r.name])),
+            score=replace(r.score, log_bayes_factor=first.score.log_bayes_factor + gain),
+            log_posterior=first.log_posterior + differences[r.name],
+            posterior=posterior * float(np.exp(differences[r.name])),
         )
-    return tuple(sorted((beside.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
+    return tuple(sorted((raised.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
 
 
 def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
@@ -357,39 +359,40 @@ def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
 def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
     """Return effects of which at least one is needed though none is certain by itself, likeliest first; () if none is.
 
-    Random effects of joints and links can explain whatever one effect would. All are removed first: if an effect is
-    certain then, they are put back, and removed one by one (that with the largest gain first) until it is certain. The
-    removed ones form the group. It is () where an unmodelled error explains the views as well.
+    None is certain since random effects of joints and links in the model explain whatever it would. So all these are
+    removed. If an effect is certain then, they are put back, and removed one by one, that with the largest gain first,
+    until it is certain again. The removed ones, as effects, are the group. It is () where an unmodelled error explains
+    the views as well.
 
     Args:
         tests: number of candidates among which the best is chosen.
     """
     # Names of effects that are random effects of the model.
-    families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
-    without_families = linear.without(families)
-    if not families or without_families.null.deviance < linear.null.deviance:
+    random_effects = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
+    without_any = linear.without(random_effects)
+    if not random_effects or without_any.null.deviance < linear.null.deviance:
         # No error of joints or links helps: none stands in for another.
         return ()
     known = {c.name: c for c in candidates if not c.empirical}
-    ranked = rank([score(without_families, c) for c in known.values()], tests)[0]
+    ranked = rank([score(without_any, c) for c in known.values()], tests)[0]
     best = next((r for r in ranked if is_certain(r)), None)
     if best is None:
         return ()
-    asked = known[best.name]
+    candidate = known[best.name]
     removed = {best.name}
-    while not is_certain(rank_one(linear.without(removed), asked, tests)):
-        others = [name for name in families if name in known and name not in removed]
+    while not is_certain(rank_one(linear.without(removed), candidate, tests)):
+        others = [name for name in random_effects if name in known and name not in removed]
         if not others:
             return ()
         bases = {name: linear.without(removed | {name}) for name in others}
-        removed.add(max(others, key=lambda name: score(bases[name], asked).log_bayes_factor))
+        removed.add(max(others, key=lambda name: score(bases[name], candidate).log_bayes_factor))
     base = linear.without(removed)
-    again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
-    if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
+    group = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
+    if unmodelled_log_posterior(base) > group[0].log_posterior - limits.ODDS:
         return ()
-    near = [r for r in again if is_contender(r) and r.comes_near(again[0])]
+    near = [r for r in group if is_contender(r) and r.comes_near(group[0])]
     # One far ahead is no name either: it was not certain with the others as random effects. Then all are returned.
-    return tuple(near) if len(near) > 1 else again
+    return tuple(near) if len(near) > 1 else group
 
 
 def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
@@ -440,9 +443,10 @@ def _refusals(refused: Mapping[str, str]) -> dict[str, Any]:
 
 
 def both_missing(pair: tuple[Ranked, Ranked]) -> dict[str, Any]:
-    """Return the changes that name the first of two effects, which are missing both."""
+    """Return the changes of the evidence where two effects are missing, of which the first is named."""
     return {"explanation": pair[:1], "further": pair[1], "together": pair}
 
 
 def names_of(effects: Sequence[Ranked]) -> str:
+    """Return the names of effects as text."""
     return ", ".join(r.name for r in effects)

@@ -17,13 +17,13 @@ from stitch.system.threads import parallel
 
 @dataclass(frozen=True)
 class Ranked:
-    """A score with its place among all."""
+    """The score of a candidate, and what it means among all candidates."""
 
     score: Score
-    adjusted: float  # family-wise p
-    log_posterior: float  # not yet normalised
-    posterior: float
-    tests: int = 1  # among which it counts in the family-wise p
+    adjusted: float  # family-wise p-value (Bonferroni)
+    log_posterior: float  # log Bayes factor + log prior: not yet normalised
+    posterior: float  # normalised over all candidates and that nothing is missing
+    tests: int = 1  # number of tests for which the p-value is adjusted
 
     @property
     def name(self) -> str:
@@ -55,8 +55,8 @@ class Ranked:
 
         That prior is a judgement: it may order effects that explain equally much, but exclude none of them.
         """
-        behind = min(best.log_posterior - self.log_posterior, best.log_evidence - self.log_evidence)
-        return behind < limits.ODDS
+        difference = min(best.log_posterior - self.log_posterior, best.log_evidence - self.log_evidence)
+        return difference < limits.ODDS
 
 
 def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
@@ -70,10 +70,10 @@ def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tupl
 
 
 def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array | None = None) -> Ranked:
-    """Return the score of one candidate, ranked as one that was chosen among `tests` of them.
+    """Return one candidate scored and ranked, as one that was chosen among `tests` of them.
 
     Args:
-        start: (c,) variances to begin with; None: where their maximum may lie.
+        start: (c,) variances at which the fit begins; None: those of the null fit, and other likely ones.
     """
     return rank([score(linear, candidate, start)], tests)[0][0]
 
@@ -130,9 +130,9 @@ def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: floa
         best: candidate in the model in which the hypothesis was scored.
         log_posterior: of the hypothesis, in that model; its odds over `best` are carried over to the ranking.
     """
-    share = next(r for r in ranked if r.name == best.name).posterior
-    room = 1 + share * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
-    return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
+    of_best = next(r for r in ranked if r.name == best.name).posterior
+    total = 1 + of_best * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
+    return tuple(replace(r, posterior=r.posterior / total) for r in ranked)
 
 
 def is_contender(ranked: Ranked) -> bool:
@@ -147,12 +147,12 @@ def is_contender(ranked: Ranked) -> bool:
 
 
 def is_certain(ranked: Ranked) -> bool:
-    """Return whether it is enough for an alarm."""
+    """Return whether an effect is enough for an alarm by itself: a contender at 12 to 1 over nothing."""
     return is_contender(ranked) and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
 
 def stands_out(ranked: Ranked) -> bool:
-    """Return whether a shape without a cause is enough for an alarm."""
+    """Return whether a law, or an empirical shape, is enough for an alarm: significant, and 12 to 1 over nothing."""
     # Bonferroni over two families of such shapes: laws of the dictionary, and empirical effects.
     return ranked.adjusted < 0.5 * limits.ALPHA_UNKNOWN and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
@@ -160,11 +160,7 @@ def stands_out(ranked: Ranked) -> bool:
 def conditioned_without(
     linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, start: Array | None = None
 ) -> LinearModel:
-    """Return the linear model with the chosen effects as further unknowns, all but `one`.
-
-    Args:
-        start: (c,) variances at which their fit begins; None: as for `conditioned_on_effects`.
-    """
+    """Return the linear model with all chosen effects but `one` as further unknowns, as `conditioned_on_effects`."""
     return conditioned_on_effects(linear, [r for r in chosen if r.name != one.name], start)
 
 

@@ -43,23 +43,22 @@ from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData
 from stitch.system.threads import parallel
 
-# Effects that are taken out at once.
-_TAKEN_OUT = 2
+# Chosen effects that `exchanged_set` removes at once, at the most.
+_MOST_REMOVED = 2
 
 
 def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, str] | None:
-    """Return the weakest effect of labelled points that does not hold its place beside all others, and why; None if all
-    do.
+    """Return the name of the weakest effect that the model does not need beside all others, and why; None if all hold.
 
-    Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
-    do not allow it.
+    Only for labelled points: effects are tested in parallel, and matching scans takes all cores already. Of many poses
+    they are tested one after the other, for memory.
 
     Args:
         names: effects of the model that may go.
     """
-    asked = [term for term in state.model.terms if term.name in names]
+    terms = [term for term in state.model.terms if term.name in names]
     each = parallel if state.measurement.views.count < limits.MANY_POSES else map
-    tested = zip(asked, each(partial(_test_effect, state), asked), strict=True)
+    tested = zip(terms, each(partial(_test_effect, state), terms), strict=True)
     failing = [(factor, term.name, reason) for term, (factor, reason) in tested if reason is not None]
     if not failing:
         return None
@@ -68,7 +67,7 @@ def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, st
 
 
 def _test_effect(state: RunData, term: Term) -> tuple[float, str | None]:
-    """Return the log Bayes factor of an effect beside the others, and why it should go, if it should."""
+    """Return the log Bayes factor of an effect beside the others, and the reason to drop it; None if it holds."""
     name = term.name
     linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)
     candidate = candidate_as_fitted(linear, term)
@@ -83,11 +82,11 @@ def _test_effect(state: RunData, term: Term) -> tuple[float, str | None]:
 
 @dataclass(frozen=True)
 class ForwardSelection:
-    """Effects beside each other; first the one without which most would stay unexplained."""
+    """Effects that are missing together."""
 
-    effects: tuple[Ranked, ...]
-    explained: float  # log posterior of what was found one by one
-    refused: dict[str, str]  # effects that explain much and are not among them, and why
+    effects: tuple[Ranked, ...]  # each scored beside all others, the likeliest first
+    explained: float  # sum of the log posteriors of the effects with which the selection began
+    refused: dict[str, str]  # by name of an effect that explains much and is not among them, why
 
 
 def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> ForwardSelection:
@@ -128,10 +127,10 @@ def _better_selection(
 
     Effects that the present selection refused, since they err beyond the measured poses, are not tried again.
     """
-    instead = exchanged_set(linear, [c for c in candidates if c.name not in selection.refused], selection.effects)
-    if not instead:
+    replacement = exchanged_set(linear, [c for c in candidates if c.name not in selection.refused], selection.effects)
+    if not replacement:
         return None
-    other = _stable_selection(linear, candidates, [rank_one(linear, c, len(candidates)) for c in instead])
+    other = _stable_selection(linear, candidates, [rank_one(linear, c, len(candidates)) for c in replacement])
     return other if is_better_set(linear, other.effects, selection.effects) else None
 
 
@@ -140,9 +139,13 @@ def _stable_selection(
 ) -> ForwardSelection:
     """Return a selection in which every effect is certain beside all others and holds at ends of joint ranges left out.
 
-    Each round removes effects that are not certain. Then the one that predicts the ends worst goes, unless it helps
-    there beside the likeliest further effect; others may explain what it imitated, so effects are added again. Where
-    none is wrong at the ends altogether, one that is wrong at a single end is exchanged for one that predicts better.
+    Each round has four steps:
+
+    1. Effects that are not certain beside all others are removed.
+    2. The one that predicts the ends worst is removed, unless it helps there beside the likeliest further effect.
+    3. Where none was, one that errs at a single end is exchanged for one that predicts it better (`find_exchange`).
+    4. Effects are added again: others may explain what the one removed had imitated.
+
     It ends when nothing is left to remove or exchange.
 
     Args:
@@ -154,29 +157,31 @@ def _stable_selection(
     refused = dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
-        chosen, beyond = _eliminate_backward(linear, chosen, len(remaining))
-        at_all_ends = zip(chosen, beyond.values(), strict=True)
-        erring = [(r, at_ends) for r, at_ends in at_all_ends if at_ends is not None and not at_ends.helps]
-        erring.sort(key=lambda each: -each[1].share)
-        worst = next((each for each in erring if not _helps_beside_next(linear, remaining, chosen, each[0])), None)
-        replacement: Ranked | None = None
+        chosen, end_tests = _eliminate_backward(linear, chosen, len(remaining))
+        tests = zip(chosen, end_tests.values(), strict=True)
+        erring = [(r, at_ends) for r, at_ends in tests if at_ends is not None and not at_ends.helps]
+        erring.sort(key=lambda pair: -pair[1].share)
+        worst = next((pair for pair in erring if not _helps_beside_next(linear, remaining, chosen, pair[0])), None)
+        replacements = list[Ranked]()
         if worst is not None:
             name, at_ends = worst[0].name, worst[1]
             refused[name] = at_ends.rejection_reason(name)
-            (unseen.add if at_ends.unseen else unseen.discard)(name)
+            unseen -= {name}
+            unseen |= {name} if at_ends.unseen else set()
         else:
             rivals = [c for c in candidates if c.name not in exchanged]
-            exchange = find_exchange(linear, rivals, chosen, beyond)
+            exchange = find_exchange(linear, rivals, chosen, end_tests)
             if exchange is None:
                 break
             name, reason, replacement = exchange
+            replacements.append(replacement)
             refused.pop(replacement.name, None)  # it erred beside the one that gives way
             refused[name] = reason
             exchanged.add(name)
             unseen -= {name, replacement.name}
         remaining = [c for c in remaining if c.name != name]
         kept = [r for r in chosen if r.name != name]
-        chosen = _add_effects(linear, remaining, kept if replacement is None else [*kept, replacement])
+        chosen = _add_effects(linear, remaining, [*kept, *replacements])
     if len(unseen) > 1:
         refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
     likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
@@ -190,14 +195,14 @@ def _helps_beside_next(
 
     That further effect may be too small to be named. Without it, r takes over a part of it, and errs at the ends.
     """
-    beside = conditioned_on_effects(linear, chosen)
-    further = promising(beside, [c for c in candidates if c.name not in {r.name for r in chosen}], 1)
-    if not further or further[0][1] < 0:
+    with_chosen = conditioned_on_effects(linear, chosen)
+    likeliest = promising(with_chosen, [c for c in candidates if c.name not in {r.name for r in chosen}], 1)
+    if not likeliest or likeliest[0][1] < 0:
         return False
-    second = rank_one(beside, further[0][0], len(candidates))
-    rest = conditioned_without(linear, [*chosen, second], r)
-    again = rank_one(rest, r.score.candidate, len(candidates))
-    at_ends = extrapolate(rest, again.score) if is_certain(again) else None
+    further = rank_one(with_chosen, likeliest[0][0], len(candidates))
+    without_r = conditioned_without(linear, [*chosen, further], r)
+    again = rank_one(without_r, r.score.candidate, len(candidates))
+    at_ends = extrapolate(without_r, again.score) if is_certain(again) else None
     return at_ends is not None and at_ends.helps
 
 
@@ -206,10 +211,10 @@ def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: S
     chosen = list(chosen)
     while len(chosen) < limits.MAX_JOINT_EFFECTS:
         others = [c for c in candidates if c.name not in {r.name for r in chosen}]
-        following = _next_effect(conditioned_on_effects(linear, chosen), others)
-        if following is None:
+        further = _next_effect(conditioned_on_effects(linear, chosen), others)
+        if further is None:
             break
-        chosen.append(following)
+        chosen.append(further)
     return chosen
 
 
@@ -224,9 +229,9 @@ def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | Non
     for tried in (near, [c for c, _ in likely if c not in near]):
         # Preselected by what they gain: all that were looked at count as tests.
         ranked, _ = rank(list(parallel(partial(score, base), tried)), tests=len(others))
-        following = next((r for r in ranked if is_certain(r)), None)
-        if following is not None:
-            return following
+        certain = next((r for r in ranked if is_certain(r)), None)
+        if certain is not None:
+            return certain
     return None
 
 
@@ -244,33 +249,35 @@ def _eliminate_backward(
     start = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
 
     def beside_others(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
-        beside = conditioned_without(linear, among, r, start)
-        again = rank_one(beside, r.score.candidate, tests, start)
-        return again, extrapolate(beside, again.score) if is_certain(again) else None
+        """Return an effect scored with the others of `among` in the model, and, if it is certain, its test at ends."""
+        without_r = conditioned_without(linear, among, r, start)
+        again = rank_one(without_r, r.score.candidate, tests, start)
+        return again, extrapolate(without_r, again.score) if is_certain(again) else None
 
-    # Mostly all hold their place: then none was asked beside one that goes, and the order is of no account.
     kept = list(chosen)
-    beyond = dict[str, Extrapolation | None]()
-    as_asked = True
-    for r, at_once in zip(chosen, list(parallel(beside_others, chosen)), strict=True):
-        again, at_ends = at_once if as_asked else beside_others(r, kept)
+    end_tests = dict[str, Extrapolation | None]()
+    parallel_results_hold = True
+    for r, result in zip(chosen, list(parallel(beside_others, chosen)), strict=True):
+        again, at_ends = result if parallel_results_hold else beside_others(r, kept)
         others = [other for other in kept if other.name != r.name]
         if not (is_certain(again) and again.score.form is r.score.form):
-            beyond, as_asked = {}, False  # what was asked of the others was asked beside this one
+            # The others were scored beside this one as it was.
+            parallel_results_hold = False
+            end_tests = {}
         kept = [*others, again] if is_certain(again) else others
         if is_certain(again):
-            beyond[again.name] = at_ends
+            end_tests[again.name] = at_ends
     for r in kept:
-        if r.name not in beyond:
-            beyond[r.name] = extrapolate(conditioned_without(linear, kept, r, start), r.score)
-    return kept, {r.name: beyond[r.name] for r in kept}
+        if r.name not in end_tests:
+            end_tests[r.name] = extrapolate(conditioned_without(linear, kept, r, start), r.score)
+    return kept, {r.name: end_tests[r.name] for r in kept}
 
 
 def find_exchange(
     linear: LinearModel,
     candidates: Sequence[Candidate],
     chosen: Sequence[Ranked],
-    beyond: Mapping[str, Extrapolation | None],
+    end_tests: Mapping[str, Extrapolation | None],
 ) -> tuple[str, str, Ranked] | None:
     """Return the name of an effect to exchange, the reason, and its replacement; None if all chosen effects may stay.
 
@@ -280,29 +287,29 @@ def find_exchange(
     Args:
         candidates: possible replacements.
         chosen: effects in the model together.
-        beyond: by name, each one's test at the ends with the others in the model.
+        end_tests: by name, the test of each chosen effect at the ends with the others in the model.
     """
     names = {r.name for r in chosen}
     for r in chosen:
-        at_ends = beyond[r.name]
+        at_ends = end_tests[r.name]
         if at_ends is None or not at_ends.errs_somewhere:
             continue
-        rest = conditioned_without(linear, chosen, r)
-        for rival in _better_extrapolating_effects(rest, [c for c in candidates if c.name not in names], at_ends):
-            beside = conditioned_on_effects(rest, [rival])
-            left = extrapolate(beside, rank_one(beside, r.score.candidate, len(candidates)).score)
-            if left is not None and not left.helps:
-                return r.name, f"{left.rejection_reason(r.name)}; this beside {rival.name}", rival
+        without_r = conditioned_without(linear, chosen, r)
+        for rival in _better_extrapolating_effects(without_r, [c for c in candidates if c.name not in names], at_ends):
+            with_rival = conditioned_on_effects(without_r, [rival])
+            beside_rival = extrapolate(with_rival, rank_one(with_rival, r.score.candidate, len(candidates)).score)
+            if beside_rival is not None and not beside_rival.helps:
+                return r.name, f"{beside_rival.rejection_reason(r.name)}; this beside {rival.name}", rival
     return None
 
 
 def _better_extrapolating_effects(
     rest: LinearModel, candidates: Sequence[Candidate], at_ends: Extrapolation
 ) -> list[Ranked]:
-    """Return certain effects that more probably predict a further end of a joint's range than a given test says.
+    """Return certain effects that likelier predict a further end of a joint's range than a given one, best first.
 
-    The best comes first. Events are left out: one that begins at the second view imitates a lasting effect, and the
-    ends cannot tell the two apart.
+    Events are left out: one that begins at the second view imitates a lasting effect, and the ends cannot tell the two
+    apart.
 
     Args:
         rest: the model without the effect that would be exchanged.
@@ -319,11 +326,11 @@ def _better_extrapolating_effects(
 
 
 def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Candidate]:
-    """Return a set of effects 20 to 1 likelier than the chosen one, without some of its effects; [] if there is none.
+    """Return a set of effects 20 to 1 likelier than the chosen set, without some of its effects; [] if there is none.
 
-    All sets are compared at the variances beside the chosen effects: information and vector of all candidates are
-    computed once, and sets select from them. Up to `_TAKEN_OUT` chosen effects are removed, then a forward selection
-    and a backward elimination follow.
+    Up to `_MOST_REMOVED` chosen effects are removed, then a forward selection and a backward elimination follow. All
+    sets are compared at the variances beside the chosen effects, so that information and vector of all candidates are
+    computed once, and a set takes its rows and columns of them.
 
     Args:
         candidates: possible members; those with time constants or events only if they are chosen.
@@ -332,35 +339,34 @@ def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: 
     if not chosen:
         return []
     chosen_forms = {r.name: r.score.form for r in chosen}
-    free = [c for c in candidates if c.name in chosen_forms or not c.forms[0].term.gridded.any()]
-    # Sums of all candidates at once, at the scatter that is left beside the chosen effects.
-    scatter = conditioned_on_effects(linear, chosen).null.variances
-    at = replace(linear, null=at_variances(linear.mixed, scatter))
-    forms = [chosen_forms.get(c.name) or c.forms[0] for c in free]
-    white = [at.residual(form.columns) * form.sizes for form in forms]
-    ends = np.cumsum([0, *(columns.shape[1] for columns in white)])
-    places = [np.arange(begin, end) for begin, end in pairwise(ends)]
+    eligible = [c for c in candidates if c.name in chosen_forms or not c.forms[0].term.gridded.any()]
+    variances = conditioned_on_effects(linear, chosen).null.variances
+    beside_chosen = replace(linear, null=at_variances(linear.mixed, variances))
+    forms = [chosen_forms.get(c.name) or c.forms[0] for c in eligible]
+    white = [beside_chosen.residual(form.columns) * form.sizes for form in forms]
+    bounds = np.cumsum([0, *(columns.shape[1] for columns in white)])
+    columns_of = [np.arange(begin, end) for begin, end in pairwise(bounds)]
     stacked = np.hstack(white)
     information = stacked.T @ stacked
-    vector = stacked.T @ at.white_residual
+    vector = stacked.T @ beside_chosen.white_residual
 
-    def log_posterior(numbers: Sequence[int]) -> float:
-        """Return the log posterior of a set of candidates, by their indices in `free`, not yet normalised."""
-        index = np.concatenate([np.zeros(0, np.int64), *(places[k] for k in numbers)])
-        evidence = log_evidence_at_scales(information[np.ix_(index, index)], vector[index], PLAUSIBLE)
-        return log_mixture(evidence, PLAUSIBLE) + len(numbers) * float(np.log(limits.PRIOR_PHYSICAL / len(free)))
+    def log_posterior(members: Sequence[int]) -> float:
+        """Return the log posterior of a set of candidates, by their indices in `eligible`, not yet normalised."""
+        columns = np.concatenate([np.zeros(0, np.int64), *(columns_of[k] for k in members)])
+        evidence = log_evidence_at_scales(information[np.ix_(columns, columns)], vector[columns], PLAUSIBLE)
+        return log_mixture(evidence, PLAUSIBLE) + len(members) * float(np.log(limits.PRIOR_PHYSICAL / len(eligible)))
 
-    now = [k for k, c in enumerate(free) if c.name in chosen_forms]
-    others = [k for k in range(len(free)) if k not in now]
+    present = [k for k, c in enumerate(eligible) if c.name in chosen_forms]
+    others = [k for k in range(len(eligible)) if k not in present]
     best = list[int]()
-    least = log_posterior(now) + limits.ODDS
-    for taken in (out for count in range(1, _TAKEN_OUT + 1) for out in combinations(now, count)):
-        rest = [k for k in now if k not in taken]
-        numbers = select_forward(log_posterior, others, rest, limits.MAX_JOINT_EFFECTS)
-        numbers = eliminate_backward(log_posterior, numbers)
-        if (value := log_posterior(numbers)) > least:
-            best, least = numbers, value
-    return [free[k] for k in best]
+    best_log_posterior = log_posterior(present) + limits.ODDS
+    for removed in (some for count in range(1, _MOST_REMOVED + 1) for some in combinations(present, count)):
+        rest = [k for k in present if k not in removed]
+        members = select_forward(log_posterior, others, rest, limits.MAX_JOINT_EFFECTS)
+        members = eliminate_backward(log_posterior, members)
+        if (value := log_posterior(members)) > best_log_posterior:
+            best, best_log_posterior = members, value
+    return [eligible[k] for k in best]
 
 
 def is_better_set(linear: LinearModel, new: Sequence[Ranked], old: Sequence[Ranked]) -> bool:
@@ -374,7 +380,7 @@ def is_better_set(linear: LinearModel, new: Sequence[Ranked], old: Sequence[Rank
 
 
 def _log_posterior(linear: LinearModel, chosen: Sequence[Ranked]) -> float:
-    """Return the log posterior of effects together, not yet normalised."""
+    """Return the log posterior of several effects together, not yet normalised, fitted with all variances."""
     if not chosen:
         return 0.0
     G = linear.in_blocks(np.hstack([r.score.form.columns for r in chosen]))

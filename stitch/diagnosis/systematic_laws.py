@@ -47,41 +47,42 @@ _WAVES = {
     "a wave, three times a turn": 3,
     "a wave, four times a turn": 4,
 }
-# What views follow in their order: a step from some view on, or where no time is stated a trend.
+# Drivers without a column: a step from some view on; a trend over the views where no time is stated; the side to which
+# gravity pulls what hangs with play.
 STEP = "view order"
 NUMBER = "view number"
-# To which side of what it holds it falls.
 GRAVITY = "gravity"
 # Degree of a smooth function of a covariate; each power usually half as large as the one before.
 _DEGREE = 3
-# Views at an end that make a step; steps that are tried at the most, and laws and forms whose variances are fitted anew
-# (time).
+# Views that a step leaves at either end at least; steps that are tried at the most; laws, and forms of each, that are
+# fitted with all variances (time).
 _VIEWS_AT_END, _MOST_STEPS = 2, 50
-_LAWS_FITTED, _FORMS_FITTED = 6, 12
-# Nats by which places may come nearer to the likeliest once variances are fitted anew.
-_NEAR_BEFORE = 2.0
-# Two columns of which this share is common are one.
+_LAWS_FITTED, _FORMS_OF_A_LAW_FITTED = 6, 2
+# Nats by which a place may come nearer to the likeliest once variances are fitted again.
+_GAIN_BY_FIT = 2.0
+# Columns of which this share of the square is in the span of others say the same.
 _SAME = 0.999
-_SAME_VALUE = 1e-9
-# Directions of the flange to whose other side gravity may drop what hangs there with play.
-_ACROSS = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
-_FALLS = ("along x", "between x and y", "along y", "between y and -x", "along z")
+# Values that differ by less are constant.
+_CONSTANT = 1e-9
+# Axes of the flange to whose other side gravity may drop what hangs there with play, and what each is called.
+_FALL_AXES = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
+_FALL_WORDS = ("along x", "between x and y", "along y", "between y and -x", "along z")
 # What friction holds of the weight, steel on steel.
 _FRICTION = 0.2
 _BODIES = ("part", "mount")
 _NOT_LINKS = (*_BODIES, "robot")
 # A joint that turns less (rad) follows nothing of its own angle.
 _STILL = np.radians(2.0)
-# What is usual of a joint (rad); of a flange `usual_twist` says it.
-_JOINT = 4e-4
-# The same of a link's lengths: steel by 17 °C.
-_GROWN = 2e-4
+# Usual error of a joint (rad); that of a flange is `usual_twist`.
+_USUAL_JOINT = 4e-4
+# Usual growth of a link's lengths: steel by 17 °C.
+_USUAL_GROWTH = 2e-4
 # Share of a law by which a link's length follows anything but warmth and time (judgement).
 _SELDOM_GROWS = 0.1
-# Draws of what chance makes of the clearest law, their seed; by-count chances beyond which none is clear, and numbers
-# among which there is no time to draw.
+# Random residuals that are drawn for the family-wise p-value, and their seed. Bonferroni's value beyond which it is not
+# sought, since no law is clear, and number of observations beyond which drawing takes too long.
 _DRAWS, _SEED = 499, 20
-_DRAWN_UP_TO, _MOST_DRAWN = 1.0, 400
+_LARGEST_P_VALUE, _MOST_OBSERVATIONS = 1.0, 400
 
 
 def _grow(links: Links, views: Views, g: Array) -> Links:
@@ -89,19 +90,19 @@ def _grow(links: Links, views: Views, g: Array) -> Links:
     return replace(links, lengths=links.lengths * (1 + g))
 
 
-_LENGTHS = Effect("lengths", "links", {"g": per_joint("1", _GROWN, 1.0)}, _grow, needs=(), prefers=(), tier="empirical")
+_LENGTHS = Effect("lengths", "links", {"g": per_joint("1", _USUAL_GROWTH, 1.0)}, _grow, (), (), tier="empirical")
 
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """What views may follow."""
+    """What views may follow, as a covariate, and the shapes in which a law may follow it."""
 
     name: str  # a column of views.csv, time, view order, angle of joint 3, view (a step)
     unit: str
-    values: Array  # (V,)
-    shapes: dict[str, Array]  # in words: (V, R), nought where the law is none yet, 1 at the most
-    joint: int | None = None  # the one that alone may follow it, counted from 1
-    kinds: tuple[str, ...] = ("part", "mount", "robot", "links")  # of places that may
+    values: Array  # (V,) of the views
+    shapes: dict[str, Array]  # by their words, (V, R): zero where the law begins, at most 1
+    joint: int | None = None  # the only joint that may follow it, counted from 1; None: any
+    kinds: tuple[str, ...] = ("part", "mount", "robot", "links")  # of places that may follow it
 
     @property
     def covariate(self) -> str:
@@ -111,41 +112,41 @@ class Driver:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a law acts."""
+    """Where a law acts: a body, a joint or a link, with the k axes along or about which it may move."""
 
-    name: str  # joint 3, link 2, or all that moves alike: the part or the base
-    twists: Array  # (V, 6, k) of the views about the observation's centre, per rad and length_unit
+    name: str  # joint 3, link 2, or all bodies that move alike: the part or the base
+    twists: Array  # (V, 6, k) of the views about the observation's centre, per unit along or about each axis
     sizes: Array  # (k,) that are usual
-    whole: Indices  # all that is independent of these; the others are further axes
-    units: tuple[str, ...]  # rad, or length_unit
+    independent: Indices  # axes of which all others are combinations
+    units: tuple[str, ...]  # (k,) rad, or length_unit
     joint: int | None = None  # counted from 1
     kind: str = "robot"  # place of effects that act there: robot, links, part, mount
 
     @property
     def with_base(self) -> bool:
-        """True where the base is told too, since it moves alike."""
+        """True where the base is one of the bodies that move alike."""
         return "base" in self.name
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A place that follows something, in one form."""
+    """One form of a law, that a place follows a driver: in one shape, along or about some of the place's axes."""
 
     place: Place
     driver: Driver
-    shape: str  # of those of the driver
-    columns: Indices  # of the place's that it has
-    centred: bool = False  # nought on average over the views, and not where the driver stands at first
+    shape: str  # in words, a key of the driver's shapes
+    axes: Indices  # (a,) of the place, along or about which it moves
+    centred: bool = False  # True: zero on average over the views; False: zero where the driver stands at first
 
     @property
     def key(self) -> tuple[str, str]:
-        """What tells laws from each other, whatever their form."""
+        """Names of place and driver, the same for all forms of a law."""
         return self.place.name, self.driver.name
 
     @property
-    def is_whole(self) -> bool:
-        """True for all six numbers, or a joint that counts from where its driver stands at first."""
-        return self.columns is self.place.whole and not self.centred
+    def is_full(self) -> bool:
+        """True for the form with all independent axes of its place, zero where the driver stands at first."""
+        return self.axes is self.place.independent and not self.centred
 
     @cached_property
     def shapes(self) -> Array:
@@ -155,18 +156,18 @@ class Law:
 
     @cached_property
     def sizes(self) -> Array:
-        """(k·R,) usual sizes."""
-        return np.outer(self.place.sizes[self.columns], 0.5 ** np.arange(self.shapes.shape[1])).ravel()
+        """(a·R,) usual sizes of its coefficients, axis by axis; each shape half as large as the one before."""
+        return np.outer(self.place.sizes[self.axes], 0.5 ** np.arange(self.shapes.shape[1])).ravel()
 
     @property
-    def among(self) -> Indices:
-        """(k·R,) which of the columns of all axes of the place are its own."""
+    def column_indices(self) -> Indices:
+        """(a·R,) which of the k·R columns of all axes of the place belong to its own axes."""
         shapes = self.shapes.shape[1]
-        return (shapes * self.columns[:, None] + np.arange(shapes)).ravel()
+        return (shapes * self.axes[:, None] + np.arange(shapes)).ravel()
 
-    def reduced(self, observation: Observation) -> Array:
-        """(n, k·R) columns of the reduced observations."""
-        moved = self.place.twists[:, :, self.columns, None] * self.shapes[:, None, None, :]
+    def reduced_columns(self, observation: Observation) -> Array:
+        """Return the columns (n, a·R) of its coefficients in the reduced observations."""
+        moved = self.place.twists[:, :, self.axes, None] * self.shapes[:, None, None, :]
         return observation.from_twists(moved.reshape(6 * len(moved), -1))
 
     @property
@@ -186,37 +187,38 @@ class Law:
 
 @dataclass(frozen=True)
 class Dictionary:
-    """All laws that views can show, and the prior share of each form of its law."""
+    """All laws that views can show, in all their forms, with the prior share of each form in its law."""
 
-    laws: tuple[Law, ...]
+    laws: tuple[Law, ...]  # L forms, several of each law
     shares: Array  # (L,)
-    said_by: dict[tuple[str, str], frozenset[str]]  # of each law, the effects that say it
+    said_by: dict[tuple[str, str], frozenset[str]]  # by the key of a law, the effects that say it
     observation: Observation
 
     def credited(self, effect: Ranked, laws: Sequence[Ranked]) -> Ranked:
-        """Return an effect with the evidence of the law that it says, which may be of one axis where it has six.
+        """Return an effect with the log posterior of the law that it says, if that explains more than the effect.
 
-        A law has several shapes, of which an effect may say one: a wave twice a turn is none once a turn. And it is of
-        one joint, which an effect does not tell before: of so many joints, each alone or all together.
+        The law may act along one axis where the effect has six. It counts only in a shape that the effect can have: a
+        wave twice a turn is none once a turn. A law of one of J joints is charged log 2J: an effect does not say
+        beforehand which joint errs, or whether all do.
         """
-        whole = _whole_forms(effect.score.candidate)
+        spans = _full_spans(effect.score.candidate)
         joints = sum(place is not None for place in {law.place.joint for law in self.laws})
-        said = [
+        of_laws = [
             r.score.log_bayes_factor - (float(np.log(2 * joints)) if law_of(r).place.joint else 0.0)
             for r in laws
             if effect.name in self.said_by[law_of(r).key]
-            and any(form.contains(Span(r.score.form.columns)) for form in whole)
+            and any(span.contains(Span(r.score.form.columns)) for span in spans)
         ]
-        more = max([0.0, *(factor - effect.score.log_bayes_factor for factor in said)])
-        return replace(effect, log_posterior=effect.log_posterior + more)
+        gain = max([0.0, *(factor - effect.score.log_bayes_factor for factor in of_laws)])
+        return replace(effect, log_posterior=effect.log_posterior + gain)
 
     @cached_property
-    def numbers(self) -> dict[tuple[str, str], list[int]]:
-        """Numbers of the forms of each law that is told from the others."""
-        numbers: dict[tuple[str, str], list[int]] = {key: [] for key in self.said_by}
+    def forms_of(self) -> dict[tuple[str, str], list[int]]:
+        """By the key of a law, the indices of its forms in `laws`."""
+        forms: dict[tuple[str, str], list[int]] = {key: [] for key in self.said_by}
         for i, law in enumerate(self.laws):
-            numbers[law.key].append(i)
-        return numbers
+            forms[law.key].append(i)
+        return forms
 
     @cached_property
     def stacks(self) -> list[tuple[Place, Array, Indices]]:
@@ -224,29 +226,34 @@ class Dictionary:
         return list(stacked(self.laws))
 
     def without(self, linear: LinearModel, laws: Sequence[Ranked], effect: Ranked) -> tuple[Ranked, ...]:
-        """Return the laws that are something else than an effect: it does not say them, nor are they it in these views.
+        """Return the laws that are rivals of an effect: those that it does not say, and that are not the same here.
 
-        There, a law of the effect's own place is the effect where its columns are combinations of the effect's.
+        A law of the body on which the effect acts is the same in these views if its columns are combinations of the
+        effect's.
         """
         rivals = [r for r in laws if effect.name not in self.said_by[law_of(r).key]]
         place = effect.score.candidate.effect.place
-        explained = Span(linear.residual(effect.score.form.columns))
+        span = Span(linear.residual(effect.score.form.columns))
         return tuple(
             r
             for r in rivals
             if law_of(r).place.joint is not None
             or law_of(r).place.kind != place
             or law_of(r).driver.name == GRAVITY
-            or not explained.contains(Span(linear.residual(r.score.form.columns)))
+            or not span.contains(Span(linear.residual(r.score.form.columns)))
         )
 
 
 def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> Dictionary:
-    """Return the laws of a session, and which of the candidates says each."""
+    """Return the dictionary of a session: each place with each driver that it may follow, and the effects that say it.
+
+    Args:
+        candidates: effects that may say a law.
+    """
     laws, shares, said_by = list[Law](), list[float](), dict[tuple[str, str], frozenset[str]]()
     views = linear.measurement.views
     drivers = list(drivers_of(views))
-    effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
+    effects = [(c, _full_spans(c)) for c in candidates if not c.empirical]
     for place in _places(linear):
         for driver in drivers:
             if driver.joint not in (None, place.joint) or place.kind not in driver.kinds:
@@ -254,8 +261,8 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
             forms = list(_forms(place, driver))
             laws += [law for law, _ in forms]
             shares += [share for _, share in forms]
-            # Mostly words tell: what the columns say is asked of few.
-            spans = cache(partial(_spans, place, driver, linear.observation))
+            # Mostly the declared needs of an effect tell: the spans, computed when first asked, are wanted of few.
+            spans = cache(partial(_full_law_spans, place, driver, linear.observation))
             said = (c.name for c, forms in effects if _says(views, c, forms, place, driver, spans))
             said_by[place.name, driver.name] = frozenset(said)
     return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
@@ -267,54 +274,68 @@ def stacked(laws: Sequence[Law]) -> Iterator[tuple[Place, Array, Indices]]:
     Each item is the place, shapes (S, V, R) of S laws over V views, and indices (S, F) in `laws` of their F forms: one
     for each choice of the place's axes, all of them first.
     """
-    alike: dict[tuple[str, int], list[int]] = {}
+    stacks: dict[tuple[str, int], list[int]] = {}
     for i, law in enumerate(laws):
-        alike.setdefault((law.place.name, law.shapes.shape[1]), []).append(i)
-    for numbers in alike.values():
-        shapes = [laws[i].shapes for i in numbers if laws[i].columns is laws[i].place.whole]
-        yield laws[numbers[0]].place, np.array(shapes), np.reshape(numbers, (len(shapes), -1))
+        stacks.setdefault((law.place.name, law.shapes.shape[1]), []).append(i)
+    for indices in stacks.values():
+        shapes = [laws[i].shapes for i in indices if laws[i].axes is laws[i].place.independent]
+        yield laws[indices[0]].place, np.array(shapes), np.reshape(indices, (len(shapes), -1))
 
 
 def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]:
-    """Return the likeliest laws beside a model, best first, with their log posterior as that of effects (`Ranked`)."""
-    laws = dictionary.laws
+    """Return the likeliest laws beside a model, best first, with their log posterior as that of effects (`Ranked`).
+
+    All forms are sized at given variances: those of the null, or of another maximum of the null's likelihood. The best
+    forms of the likeliest laws are then fitted with all variances. A law has the summed evidence of its forms.
+    """
+    laws, shares, forms_of = dictionary.laws, dictionary.shares, dictionary.forms_of
     if not laws:
         return ()
     starts = (linear, *linear.alternative_starts)
-    gains, scales, p_value = np.full(len(laws), -np.inf), np.ones(len(laws)), 1.0
+    gains, scales = np.full(len(laws), -np.inf), np.ones(len(laws))
     best_start = np.zeros(len(laws), np.int64)
     for k, at in enumerate(starts):
-        tried, scale = _gains(at, dictionary)
-        tried = tried + 0.5 * (linear.null.deviance - at.null.deviance)
-        better = tried > gains
-        gains, scales = np.where(better, tried, gains), np.where(better, scale, scales)
+        gain, scale = _gains(at, dictionary)
+        gain = gain + 0.5 * (linear.null.deviance - at.null.deviance)
+        better = gain > gains
+        gains, scales = np.where(better, gain, gains), np.where(better, scale, scales)
         best_start[better] = k
-    weighted = gains + np.log(dictionary.shares)
-    by_key = dictionary.numbers
-    order = sorted(by_key, key=lambda key: -np.logaddexp.reduce(weighted[by_key[key]]))
-    likeliest = order[:_LAWS_FITTED]
-    if weighted.max() > limits.LOG_BAYES_FACTOR:
-        # Where it acts is told too: of every place that may be the one, its likeliest.
-        of_places = {place: key for key in reversed(order) for place in key[:1]}
-        near = weighted.max() - limits.ODDS - _NEAR_BEFORE
-        likeliest += [key for key in of_places.values() if key not in likeliest and weighted[by_key[key]].max() > near]
-    prior = float(np.log(limits.PRIOR_LAWS / len(by_key)))
+    weighted = gains + np.log(shares)
+    prior = float(np.log(limits.PRIOR_LAWS / len(forms_of)))
     ranked = list[Ranked]()
-    for key in likeliest:
-        among = sorted(by_key[key], key=lambda i: -weighted[i])
-        fits = dict[int, tuple[Candidate, Score]]()
-        for i in among[: _FORMS_FITTED // _LAWS_FITTED]:
-            fits[i] = _fitted(linear, laws[i], starts[best_start[i]].null.variances, float(scales[i]))
-            weighted[i] = fits[i][1].log_bayes_factor + np.log(dictionary.shares[i])
+    for key in _laws_to_fit(dictionary, weighted):
+        forms = sorted(forms_of[key], key=lambda i: -weighted[i])
+        fits = dict[int, Score]()
+        for i in forms[:_FORMS_OF_A_LAW_FITTED]:
+            fits[i] = _fit_law(linear, laws[i], starts[best_start[i]].null.variances, float(scales[i]))
+            weighted[i] = fits[i].log_bayes_factor + np.log(shares[i])
         best = max(fits, key=lambda i: weighted[i])
-        total = float(logsumexp(weighted[among]))
-        scored = fits[best][1]
-        p_value = scored.p_value / float(dictionary.shares[best]) * len(by_key)
-        ranked.append(Ranked(replace(scored, log_bayes_factor=total), p_value, total + prior, 0.0, len(by_key)))
+        total = float(logsumexp(weighted[forms]))
+        # Bonferroni over the laws, and over the forms of the law by their shares.
+        p_value = fits[best].p_value / float(shares[best]) * len(forms_of)
+        ranked.append(Ranked(replace(fits[best], log_bayes_factor=total), p_value, total + prior, 0.0, len(forms_of)))
     ranked.sort(key=lambda r: -r.log_posterior)
     first, *others = ranked
     others = [replace(r, adjusted=min(r.adjusted, 1.0)) for r in others]
     return replace(first, adjusted=_family_wise(linear, dictionary, first)), *others
+
+
+def _laws_to_fit(dictionary: Dictionary, weighted: Array) -> list[tuple[str, str]]:
+    """Return the keys of the likeliest laws, and of the likeliest law of every place that may be the one.
+
+    Args:
+        weighted: (L,) log Bayes factor of each form plus the log of its share.
+    """
+    forms_of = dictionary.forms_of
+    order = sorted(forms_of, key=lambda key: -np.logaddexp.reduce(weighted[forms_of[key]]))
+    likeliest = order[:_LAWS_FITTED]
+    if weighted.max() > limits.LOG_BAYES_FACTOR:
+        # The place is reported too, so that every place that comes near is fitted. Reversed: the likeliest law remains.
+        best_of_place = {place: key for key in reversed(order) for place in key[:1]}
+        near = weighted.max() - limits.ODDS - _GAIN_BY_FIT
+        best_keys = [key for key in best_of_place.values() if key not in likeliest]
+        likeliest += [key for key in best_keys if weighted[forms_of[key]].max() > near]
+    return likeliest
 
 
 def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) -> float:
@@ -326,23 +347,26 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
     Args:
         ranked: the law, with Bonferroni's value in `adjusted`.
     """
-    by_count = ranked.adjusted
-    if by_count < limits.ALPHA_UNKNOWN or by_count > _DRAWN_UP_TO or linear.mixed.z.size > _MOST_DRAWN:
-        return min(by_count, 1.0)
+    bonferroni = ranked.adjusted
+    decided = bonferroni < limits.ALPHA_UNKNOWN or bonferroni > _LARGEST_P_VALUE
+    if decided or linear.mixed.z.size > _MOST_OBSERVATIONS:
+        return min(bonferroni, 1.0)
     rng = np.random.default_rng(_SEED)
     known = linear.mixed.size - linear.design.shape[1]
-    drawn = rng.standard_normal((linear.mixed.z.size, _DRAWS)) / np.sqrt(rng.chisquare(known, _DRAWS) / known)
+    # Student's t: white residuals over a scatter that is known to so many degrees of freedom.
+    residuals = rng.standard_normal((linear.mixed.z.size, _DRAWS)) / np.sqrt(rng.chisquare(known, _DRAWS) / known)
     by_rank: dict[int, list[tuple[Array, float]]] = {}
     for law, share in zip(dictionary.laws, dictionary.shares, strict=True):
-        U = column_space(linear.residual(law.reduced(linear.observation)))
+        U = column_space(linear.residual(law.reduced_columns(linear.observation)))
         by_rank.setdefault(U.shape[1], []).append((U, share))
     as_clear = np.zeros(_DRAWS, bool)
     for rank, laws in by_rank.items():
         if not rank:
             continue
-        least = np.array([by_count * share for _, share in laws]) / len(dictionary.numbers)
-        limit = rank * f_limits(np.minimum(least, 1.0), rank, known)
-        squares = (np.hstack([U for U, _ in laws]).T @ drawn) ** 2
+        # The explained square of each form at which its p-value, corrected by Bonferroni, is that of the law.
+        p_values = np.array([bonferroni * share for _, share in laws]) / len(dictionary.forms_of)
+        limit = rank * f_limits(np.minimum(p_values, 1.0), rank, known)
+        squares = (np.hstack([U for U, _ in laws]).T @ residuals) ** 2
         as_clear |= (squares.reshape(len(laws), rank, -1).sum(axis=1) >= limit[:, None]).any(axis=0)
     return float((1 + as_clear.sum()) / (1 + _DRAWS))
 
@@ -350,12 +374,14 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
 def laws_of_base(
     linear: LinearModel, dictionary: Dictionary, laws: Sequence[Ranked], effect: Score | None = None
 ) -> tuple[Ranked, ...]:
-    """Return laws of the base that explain the views as a joint's law among some laws does, each as likely as that one.
+    """Return the laws of the base by which it would do what a joint's law does, each as likely as the joint's.
+
+    For each given law of a joint that a moving base could be, it is the base with the same driver and shape.
 
     Args:
         dictionary: all laws that were tried.
-        laws: the ranked ones, of which those of joints are asked.
-        effect: the score of the joint's effect; None: as each law was fitted.
+        laws: ranked laws; those that are not of a joint are passed over.
+        effect: score of a named effect that says the joint's law; None: the law as it was fitted.
     """
     of_base = list[Ranked]()
     for ranked in laws:
@@ -367,21 +393,21 @@ def laws_of_base(
         follows = (law.driver.name, law.shape)
         for other in dictionary.laws:
             of_body = other.place.kind in _BODIES and other.place.with_base
-            if of_body and other.is_whole and (other.driver.name, other.shape) == follows:
-                base_score = _fitted(linear, other, linear.null.variances, 1.0)[1]
+            if of_body and other.is_full and (other.driver.name, other.shape) == follows:
+                base_score = _fit_law(linear, other, linear.null.variances, 1.0)
                 of_base.append(replace(ranked, score=base_score))
     return tuple(of_base)
 
 
 def could_be_base(linear: LinearModel, effect: Array, shapes: Array) -> bool:
-    """Return whether a base that moves about fixed axes, in the course of some shapes, would explain an effect as well.
+    """Return whether the base, moving along and about its own axes by the same shapes, would explain an effect as well.
 
     It would where what the base leaves of the effect is small on two scales: beside the scatter, so that likelihoods
     differ by less than 20 to 1, and beside the effect itself, so that the two are aliases in these views.
 
     Args:
-        effect: (n,) reduced observations that the effect makes.
-        shapes: (V, R) courses over the views, whose sizes about the six axes are free.
+        effect: (n,) what the effect does to the reduced observations.
+        shapes: (V, R) of its motion over the views; the base has a free coefficient for each along and about each axis.
     """
     # Where the scanner is carried, the base stands where the part does; where it is fixed, with the scanner.
     bodies = [twists for _, _, twists in _bodies(linear)]
@@ -396,17 +422,16 @@ def could_be_base(linear: LinearModel, effect: Array, shapes: Array) -> bool:
 
 
 def law_of(ranked: Ranked) -> Law:
-    """Return the law of a ranked candidate."""
+    """Return the law that a ranked candidate is; only for those of `rank_laws` and `laws_of_base`."""
     effect = ranked.score.candidate.effect
     assert isinstance(effect, LawEffect)
     return effect.law
 
 
 def law_size(linear: LinearModel, ranked: Ranked) -> tuple[float, float, str]:
-    """Return the size of a law with its sigma and unit: the largest change of the joint's angle, or of the views.
+    """Return size, sigma and unit of a law: the range of a joint's error (rad), or the largest displacement.
 
-    The change is counted from the view with the least angle, or from the first view; views move at the part. The unit
-    is rad, or the length unit.
+    A displacement is that of the part in a view, against the first view, in the length unit.
     """
     scored = ranked.score
     law = law_of(ranked)
@@ -427,36 +452,34 @@ def law_size(linear: LinearModel, ranked: Ranked) -> tuple[float, float, str]:
 
 @dataclass(frozen=True)
 class LawEffect(Effect):
-    """A law as a candidate among effects: no function of a library undoes it."""
+    """A law as a candidate among effects; it has no function, since no law is ever added to a model."""
 
     law: Law = None  # type: ignore[assignment]
 
 
-def _fitted(linear: LinearModel, law: Law, start: Array, scale: float) -> tuple[Candidate, Score]:
-    """Return a law as a candidate, and its score beside the null.
+def _fit_law(linear: LinearModel, law: Law, start: Array, scale: float) -> Score:
+    """Return the score of a law as a candidate effect, fitted with all variances.
 
     Args:
         start: (c,) variances to begin with.
-        scale: of its plausible sizes, the likeliest.
+        scale: likeliest multiple of its usual sizes.
     """
-    reduced = law.reduced(linear.observation)
-    k = reduced.shape[1] // len(law.columns)
-    units = [unit for unit in np.array(law.place.units)[law.columns] for _ in range(k)]
+    reduced = law.reduced_columns(linear.observation)
+    units = np.repeat(np.array(law.place.units)[law.axes], law.shapes.shape[1])
     parameters = tuple(
-        Parameter(f"c{i}", unit, typical=float(size))
+        Parameter(f"c{i}", str(unit), typical=float(size))
         for i, (unit, size) in enumerate(zip(units, law.sizes, strict=True))
     )
     kind = law.place.kind
     effect = LawEffect(
         law.words, kind, {}, _no_function, needs=(), prefers=(), tier="empirical", group=law.driver.name, law=law
     )
-    whole = linear.observation.expand(reduced)
-    form = Form(Term(effect, parameters), np.ones(len(parameters), bool), whole, reduced, law.sizes)
-    candidate = Candidate(effect, (form,), whole, None)
+    response = linear.observation.expand(reduced)
+    form = Form(Term(effect, parameters), np.ones(len(parameters), bool), response, reduced, law.sizes)
     trial = try_form(linear, form, start, scale)
     assert trial.values is not None and trial.covariance is not None
-    return candidate, Score(
-        candidate,
+    return Score(
+        Candidate(effect, (form,), response, None),
         True,
         form,
         trial.p_value,
@@ -475,35 +498,36 @@ def _no_function(*_: object) -> None:
 def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
     """Return log Bayes factors (L,) of all L forms at the null's variances, over all scales, and the likeliest scales.
 
-    With eigenvalues k of the information and projections g of the vector, parameters in plausible sizes, log BF at
-    scale s is ½ Σ [s² g² / (1 + s² k) − log(1 + s² k)].
+    A scale s multiplies the usual sizes, the unit of the coefficients here. With eigenvalues k of their information and
+    the score g along its eigenvectors, log BF at scale s is ½ Σ [s² g² / (1 + s² k) − log(1 + s² k)].
     """
     scales = regime_of(linear).scales
-    at = np.array(list(scales))[:, None, None, None]
-    share = np.log(list(scales.values()))
+    s = np.array(list(scales))[:, None, None, None]
+    log_shares = np.log(list(scales.values()))[:, None, None]
     gains, likeliest = np.zeros((2, len(dictionary.laws)))
     for place, shapes, index in dictionary.stacks:
         information, vector = linear.information_of_motions(place.twists, shapes)
         forms = [dictionary.laws[i] for i in index[0]]
-        for width in {len(form.columns) for form in forms}:
-            numbers = [f for f, form in enumerate(forms) if len(form.columns) == width]
-            among = np.array([forms[f].among for f in numbers])
-            sizes = np.array([forms[f].sizes for f in numbers])
-            per_size = sizes[:, :, None] * sizes[:, None, :]
-            k, turned = np.linalg.eigh(information[:, among[:, :, None], among[:, None, :]] * per_size)
-            g = np.einsum("sfij,sfi->sfj", turned, vector[:, among] * sizes)
-            square = at**2 * np.maximum(k, 0.0)
-            evidence = 0.5 * (at**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=3) + share[:, None, None]
-            gains[index[:, numbers]] = logsumexp(evidence, axis=0)
-            likeliest[index[:, numbers]] = at[evidence.argmax(axis=0), 0, 0, 0]
+        # Forms with equally many axes at once: arrays are (scales, shapes, forms, coefficients).
+        for axis_count in {len(form.axes) for form in forms}:
+            same = [f for f, form in enumerate(forms) if len(form.axes) == axis_count]
+            columns = np.array([forms[f].column_indices for f in same])
+            sizes = np.array([forms[f].sizes for f in same])
+            squared_sizes = sizes[:, :, None] * sizes[:, None, :]
+            k, vectors = np.linalg.eigh(information[:, columns[:, :, None], columns[:, None, :]] * squared_sizes)
+            g = np.einsum("sfij,sfi->sfj", vectors, vector[:, columns] * sizes)
+            square = s**2 * np.maximum(k, 0.0)
+            evidence = 0.5 * (s**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=3) + log_shares
+            gains[index[:, same]] = logsumexp(evidence, axis=0)
+            likeliest[index[:, same]] = s[evidence.argmax(axis=0), 0, 0, 0]
     return gains, likeliest
 
 
 def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
-    """Yield the two bodies at the ends of the arm, what the reference carries and what the arm's far end does.
+    """Yield the two bodies at the ends of the arm: what stands in the reference frame, then what holds the scanner.
 
     Each as name, kind, and (V, 6, 6): left twists of the views about the observation's centre per unit of a twist of
-    the body, which is counted in its own frame; rotation first, rad and length_unit.
+    the body in its own frame; rotation first, rad and length_unit.
     """
     measurement = linear.measurement
     to_centre = frames.make(np.eye(3), -linear.observation.centre)
@@ -519,7 +543,8 @@ def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
 def _places(linear: LinearModel) -> Iterator[Place]:
     """Yield the places where a law may act: the two bodies at the ends of the arm, each joint, and each link's length.
 
-    A link that moves the views as a body does, or hardly at all, is no place of its own.
+    A body has nine axes: the six of its twist in its own frame, and three rotations about the observation's centre. A
+    link that moves the views as a body does, or hardly at all, is no place of its own.
     """
     measurement = linear.measurement
     centre = linear.observation.centre
@@ -530,8 +555,9 @@ def _places(linear: LinearModel) -> Iterator[Place]:
     bodies = list[Array]()
     about_centre = np.broadcast_to(np.eye(6)[:, :3], (count, 6, 3))
     for name, kind, moved in _bodies(linear):
-        axes = moved[:, :3, :3]
-        about = np.concatenate([axes, np.zeros_like(axes)], axis=1) if kind == "mount" else about_centre
+        rotations = moved[:, :3, :3]
+        turned_mount = np.concatenate([rotations, np.zeros_like(rotations)], axis=1)
+        about = turned_mount if kind == "mount" else about_centre
         bodies.append(moved.reshape(-1, 6))
         yield Place(name, np.concatenate([moved, about], axis=2), sizes, np.arange(6), units, kind=kind)
     if measurement.views.joints.shape[1] and measurement.robot is not None:
@@ -540,60 +566,73 @@ def _places(linear: LinearModel) -> Iterator[Place]:
         ends = {0: " or the base", len(of_joints) - 1: " or what the flange carries"}
         for k, (turned, grown) in enumerate(zip(of_joints, of_links, strict=True)):
             end = ends.get(k, "")
-            yield Place(f"joint {k + 1}{end}", turned[..., None], np.array([_JOINT]), np.arange(1), ("rad",), k + 1)
+            yield Place(
+                f"joint {k + 1}{end}", turned[..., None], np.array([_USUAL_JOINT]), np.arange(1), ("rad",), k + 1
+            )
             moves_a_body = any(Span(body).contains(Span(grown.reshape(-1, 1))) for body in bodies)
-            if np.abs(grown).max() * _GROWN > usual[-1] / 10 and not moves_a_body:
-                size = np.array([_GROWN])
+            if np.abs(grown).max() * _USUAL_GROWTH > usual[-1] / 10 and not moves_a_body:
+                size = np.array([_USUAL_GROWTH])
                 yield Place(f"link {k + 1}{end}", grown[..., None], size, np.arange(1), ("1",), kind="links")
 
 
 def drivers_of(views: Views) -> Iterator[Driver]:
-    """Yield what the error of views may depend on, with its shapes.
+    """Yield what the errors of views may follow, with its shapes.
 
-    These are time or order, covariates, a step at some view, angles and moves of joints, torques, and gravity.
+    These are time or order, covariates, a step at some view, angles and moves of joints, torques, and gravity. What
+    hardly changes over the views is left out.
     """
     order = np.arange(views.count, dtype=float)
     known = [(TIME, "s", views.time)] if views.has("time") else [(NUMBER, "view", order)]
     known += [(name, "", values) for name, values in views.covariates.items()]
     for name, unit, values in known:
-        if np.ptp(values) > _SAME_VALUE:
-            yield Driver(name, unit, values, _smooth(values))
+        if np.ptp(values) > _CONSTANT:
+            yield Driver(name, unit, values, _smooth_shapes(values))
     starts = np.arange(_VIEWS_AT_END, views.count - _VIEWS_AT_END + 1)
-    picked = starts[np.unique(np.linspace(0, len(starts) - 1, min(len(starts), _MOST_STEPS)).astype(int))]
-    steps = {f"a step at view {views.names[views.number[k]]}": (order >= k)[:, None].astype(float) for k in picked}
+    tried = starts[np.unique(np.linspace(0, len(starts) - 1, min(len(starts), _MOST_STEPS)).astype(int))]
+    steps = {f"a step at view {views.names[views.number[k]]}": (order >= k)[:, None].astype(float) for k in tried}
     if steps:
         yield Driver(STEP, "view", order, steps)
-    for k, angle in enumerate(views.joints.T):
-        if np.ptp(angle) < _STILL:
-            continue
-        waves = {shape: np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for shape, n in _WAVES.items()}
-        # Errors of a gear of one and two periods a turn have a name; those of three and four have not.
-        turns, teeth = ({shape: waves[shape] for shape, n in _WAVES.items() if (n > 2) == short} for short in (0, 1))
-        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns, kinds=_NOT_LINKS)
-        yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), teeth, k + 1)
-        moves = np.degrees(angle - views.previous[:, k])
-        yield from _lines(f"j{k + 1}_move_deg", "deg", moves)
-        yield from _lines(f"j{k + 1}_approach", "", views.approach[:, k].astype(float))
+    yield from _joint_drivers(views)
     for name, torque in zip(views.torques.names, views.torques.values.T, strict=True):
-        yield from _lines(f"j{name}_torque_nm", "N m", torque)
+        yield from _proportional_driver(f"j{name}_torque_nm", "N m", torque)
     for kind, gravity in (("mount", views.gravity_at_mount), ("part", views.gravity_at_part)):
-        if gravity is None or np.ptp(gravity, axis=0).max() < _SAME_VALUE:
+        if gravity is None or np.ptp(gravity, axis=0).max() < _CONSTANT:
             continue
         falls = {
             f"a step as it falls {words}{held}": side[:, None].astype(float)
             for held, friction in (("", 0.0), (", held by friction", _FRICTION))
-            for words, side in zip(_FALLS, _fallen(gravity @ _ACROSS.T, friction).T, strict=True)
+            for words, side in zip(_FALL_WORDS, _fallen(gravity @ _FALL_AXES.T, friction).T, strict=True)
             if _VIEWS_AT_END <= side.sum() <= views.count - _VIEWS_AT_END
         }
         if falls:
             yield Driver(GRAVITY, "g", gravity[:, 1], falls, kinds=(kind,))
 
 
+def _joint_drivers(views: Views) -> Iterator[Driver]:
+    """Yield the angle, the last move and the approach of every joint that turns.
+
+    Waves of one and two periods a turn, which errors of a gear have, may show at any place. Those of three and four are
+    a driver of the joint alone.
+    """
+    for k, angle in enumerate(views.joints.T):
+        if np.ptp(angle) < _STILL:
+            continue
+        waves = {shape: np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for shape, n in _WAVES.items()}
+        long_waves = {shape: waves[shape] for shape, periods in _WAVES.items() if periods <= 2}
+        short_waves = {shape: waves[shape] for shape, periods in _WAVES.items() if periods > 2}
+        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth_shapes(angle) | long_waves, kinds=_NOT_LINKS)
+        yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), short_waves, k + 1)
+        yield from _proportional_driver(f"j{k + 1}_move_deg", "deg", np.degrees(angle - views.previous[:, k]))
+        yield from _proportional_driver(f"j{k + 1}_approach", "", views.approach[:, k].astype(float))
+
+
 def _fallen(along: Array, friction: float) -> Mask:
-    """Return (V, k) True where gravity last pulled to the positive side of an axis, by more than friction holds.
+    """Return a mask (V, k) of the views in which what hangs with play lies on the positive side of each of k axes.
+
+    It lies where gravity last pulled it by more than friction holds.
 
     Args:
-        along: (V, k) components of gravity along k axes, in the order of the views; the first view counts in any case.
+        along: (V, k) components of gravity along the axes, views in their order; the first view counts in any case.
         friction: component below which nothing moves.
     """
     pulled = np.abs(along) > friction
@@ -602,18 +641,18 @@ def _fallen(along: Array, friction: float) -> Mask:
     return np.take_along_axis(along, last, axis=0) > 0
 
 
-def _lines(name: str, unit: str, values: Array) -> Iterator[Driver]:
+def _proportional_driver(name: str, unit: str, values: Array) -> Iterator[Driver]:
     """Yield a driver with the one shape "in proportion", values over their largest size; nothing if they are constant.
 
     Args:
         values: (V,) of the views.
     """
-    if np.ptp(values) > _SAME_VALUE * max(np.abs(values).max(), 1.0):
+    if np.ptp(values) > _CONSTANT * max(np.abs(values).max(), 1.0):
         shapes = {"in proportion": (values / np.abs(values).max())[:, None]}
         yield Driver(name, unit, values, shapes, kinds=_NOT_LINKS)
 
 
-def _smooth(values: Array) -> dict[str, Array]:
+def _smooth_shapes(values: Array) -> dict[str, Array]:
     """Return shapes (V, R) over values (V,): a line, and Legendre polynomials where there are enough different values.
 
     They are zero in the first view, and 1 at the most.
@@ -630,26 +669,28 @@ def _smooth(values: Array) -> dict[str, Array]:
 def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
     """Yield the forms of one law with their shares of its prior, which add up to 1 but for rarely growing links.
 
-    A form is a shape together with a choice of the place's axes; of joints, counted from the first view or the mean.
+    A form is a shape together with a choice of axes. Of a joint it is zero in the first view, or on average. Of a body
+    it has all six axes, three of one kind (rotation, shift, rotation about the centre), or one: a third of the prior
+    each.
     """
-    shares = 1 / len(driver.shapes)
+    share = 1 / len(driver.shapes)
     for shape in driver.shapes:
         if place.joint is not None:
-            yield Law(place, driver, shape, place.whole), shares / 2
-            yield Law(place, driver, shape, place.whole, centred=True), shares / 2
+            yield Law(place, driver, shape, place.independent), share / 2
+            yield Law(place, driver, shape, place.independent, centred=True), share / 2
             continue
         if place.kind == "links":
             grows = driver.name == TIME or driver.name in TEMPERATURES
-            yield Law(place, driver, shape, place.whole), shares * (1.0 if grows else _SELDOM_GROWS)
+            yield Law(place, driver, shape, place.independent), share * (1.0 if grows else _SELDOM_GROWS)
             continue
-        axes = np.arange(place.twists.shape[2])
-        for columns in (place.whole, *axes.reshape(-1, 3), *axes.reshape(-1, 1)):
-            yield Law(place, driver, shape, columns), shares / 3 / (len(axes) // len(columns))
+        every = np.arange(place.twists.shape[2])
+        for axes in (place.independent, *every.reshape(-1, 3), *every.reshape(-1, 1)):
+            yield Law(place, driver, shape, axes), share / 3 / (len(every) // len(axes))
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """What columns (n, p) can say."""
+    """The space of all combinations of columns (n, p)."""
 
     columns: Array
 
@@ -659,7 +700,7 @@ class Span:
         return column_space(self.columns)
 
     def contains(self, other: "Span") -> bool:
-        """Return whether the other's columns are combinations of these."""
+        """Return whether the other's columns are combinations of these, up to 0.1 % of their sum of squares."""
         if not self.square or not other.square:
             return False
         return float(np.sum((self.basis.T @ other.columns) ** 2)) > _SAME * other.square
@@ -670,26 +711,35 @@ class Span:
         return float(np.sum(self.columns**2))
 
 
-def _whole_forms(candidate: Candidate) -> list[Span]:
-    """Return the forms of an effect with all its parameters."""
+def _full_spans(candidate: Candidate) -> list[Span]:
+    """Return the spans of the forms of an effect that have all its parameters, one for each value of its grid."""
     forms = candidate.forms
     return [Span(form.columns) for form in forms if form.keep.sum() == forms[0].keep.sum()]
 
 
-def _spans(place: Place, driver: Driver, observation: Observation) -> list[Span]:
-    """Return each shape of a law with all numbers of its place."""
-    return [Span(Law(place, driver, shape, place.whole).reduced(observation)) for shape in driver.shapes]
+def _full_law_spans(place: Place, driver: Driver, observation: Observation) -> list[Span]:
+    """Return the span of a law in each of its shapes, with all independent axes of its place."""
+    full_laws = (Law(place, driver, shape, place.independent) for shape in driver.shapes)
+    return [Span(law.reduced_columns(observation)) for law in full_laws]
 
 
 def _says(
     views: Views,
     candidate: Candidate,
-    whole: Sequence[Span],
+    effect_spans: Sequence[Span],
     place: Place,
     driver: Driver,
-    laws: Callable[[], Sequence[Span]],
+    law_spans: Callable[[], Sequence[Span]],
 ) -> bool:
-    """Return whether an effect implies a law: same place and driver, as the effect declares or as its columns show."""
+    """Return whether an effect implies a law: same place and driver, as the effect declares or as its columns show.
+
+    An effect of a body whose declared needs name the driver says the law. Otherwise columns decide: those of the effect
+    must be in the span of a body's law, or those of a law of a joint or link in the span of the effect.
+
+    Args:
+        effect_spans: of the effect with all its parameters.
+        law_spans: function that returns the spans of the law; called only where columns decide.
+    """
     effect = candidate.effect
     # An external axis moves a body as a whole: the part, or the base of what it carries.
     if effect.place != place.kind and not (effect.place == "axis" and place.kind in _BODIES):
@@ -699,11 +749,11 @@ def _says(
         follows.add(TIME)
     event = any(p.discrete for p in candidate.parameters)
     declared = driver.name in follows or (driver.name == STEP and event)
-    whole_body = place.joint is None and place.kind != "links"
-    if whole_body and declared:
+    of_body = place.joint is None and place.kind != "links"
+    if of_body and declared:
         return True
     if (driver.name == STEP) != event:
         return False
-    if whole_body:
-        return any(law.contains(form) for law in laws() for form in whole)
-    return any(form.contains(law) for law in laws() for form in whole)
+    if of_body:
+        return any(law.contains(span) for law in law_spans() for span in effect_spans)
+    return any(span.contains(law) for law in law_spans() for span in effect_spans)

@@ -233,7 +233,7 @@ def _likeliest_per_joint(effects: Sequence[JointEffect]) -> tuple[JointEffect, .
     """Return the likeliest effect of every joint that is within 20 to 1 of the likeliest joint.
 
     Its log Bayes factor is that of all kinds of effects of the joint together: each of the L effects has 1/L of the
-    prior. `may_follow` lists the kinds within 20 to 1 of it. () where all effects together are not 20 to 1 over nothing.
+    prior. `may_follow` lists the kinds within 20 to 1 of it. () where all together are not 20 to 1 over nothing.
 
     Args:
         effects: L of all kinds and joints, likeliest first.

@@ -71,11 +71,11 @@ def shown(linear, column):
 )
 def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, words):
     linear, _ = cell
-    laws = [law for law in dictionary_of(linear).laws if law.key == (place, follows) and law.is_whole]
+    laws = [law for law in dictionary_of(linear).laws if law.key == (place, follows) and law.is_full]
     law = next(law for law in laws if law.words == words)
     size = np.zeros(len(law.sizes))
     size[0 if law.place.joint else 3] = 1e-3 if law.place.joint else 0.3
-    found = rank_laws(shown(linear, law.reduced(linear.observation) @ size), dictionary_of(linear))
+    found = rank_laws(shown(linear, law.reduced_columns(linear.observation) @ size), dictionary_of(linear))
     assert law_of(found[0]).key == law.key and stands_out(found[0])
     value, sigma, _ = law_size(linear, found[0])
     moved = np.ptp(law.shapes, axis=0).max() * size.max()
@@ -94,7 +94,8 @@ def test_how_many_waves_a_turn_has_is_said_only_where_a_whole_one_was_driven(dri
     shape = "a wave, three times a turn"
     angles = np.linspace(25.0, 25.0 + driven, 18)
     place = Place("joint 5", np.zeros((18, 6, 1)), np.ones(1), np.arange(1), ("rad",), joint=5)
-    law = Law(place, Driver("j5_deg, in short waves", "deg", angles, {shape: np.zeros((18, 2))}, 5), shape, place.whole)
+    driver = Driver("j5_deg, in short waves", "deg", angles, {shape: np.zeros((18, 2))}, 5)
+    law = Law(place, driver, shape, place.independent)
     assert law_in_words(law) == said
     base = replace(law, place=replace(place, name="joint 1 or the base"))
     assert ("the angle of joint 5" in law_in_words(base)) and ("a turn" in law_in_words(base)) == (driven > 120)
