@@ -15,8 +15,10 @@ from stitch.numerics.frames import Array, Mask
 from stitch.session.axes import AxisMotion
 from stitch.session.measurement import Views
 
-# Sides of an axis' frame across it.
+# Sides of an axis' frame across it, x and y: z lies along the axis.
 _ACROSS = ("u", "v")
+# Components along these two sides in a twist: of its rotation, and of its translation.
+_ACROSS_ROTATION, _ACROSS_TRANSLATION = slice(0, 2), slice(3, 5)
 PLACEMENT, SCANNER_PLACEMENT = "axis_placement", "scanner_placement"
 
 
@@ -29,13 +31,20 @@ PLACEMENT, SCANNER_PLACEMENT = "axis_placement", "scanner_placement"
     turn=per_axis("linear", "rad", 0.005, 0.5, _ACROSS),
 )
 def axis_placement(motion: AxisMotion, views: Views, tilt: Array, shift: Array, turn: Array) -> AxisMotion:
-    """axis truly along exp(tilt) and through the point + shift, both across it"""
-    # Two components across each axis, axis after axis; a twist has its rotation first.
+    """axis truly along exp(tilt) and through the point + shift, both across it; a linear one along exp(turn)
+
+    Args:
+        motion: its placement (K, 6) holds a twist for each of K axes in the axis' frame, z along it.
+        views: whose axes are the R rotary and L linear ones.
+        tilt: (2R,) rad, about x and y of each rotary axis in turn.
+        shift: (2R,) length_unit, along x and y of each rotary axis in turn.
+        turn: (2L,) rad, about x and y of each linear axis in turn; where a linear axis lies makes no difference.
+    """
     placement = motion.placement.copy()
     rotary = views.axes.rotary
-    placement[rotary, :2] += tilt.reshape(-1, 2)
-    placement[rotary, 3:5] += shift.reshape(-1, 2)
-    placement[~rotary, :2] += turn.reshape(-1, 2)
+    placement[rotary, _ACROSS_ROTATION] += tilt.reshape(-1, 2)
+    placement[rotary, _ACROSS_TRANSLATION] += shift.reshape(-1, 2)
+    placement[~rotary, _ACROSS_ROTATION] += turn.reshape(-1, 2)
     return replace(motion, placement=placement)
 
 
@@ -47,7 +56,12 @@ def axis_placement(motion: AxisMotion, views: Views, tilt: Array, shift: Array, 
     t=per_scanner("mm", 5.0, 500.0),
 )
 def scanner_placement(views: Views, r: Array, t: Array) -> Array:
-    """every scanner but the first truly at its own hand-eye times exp(r, t)"""
+    """every scanner but the first truly at its own hand-eye times exp(r, t)
+
+    Args:
+        views: taken by K scanners.
+        r, t: (3 (K − 1),) rad and length_unit, scanner after scanner from the second on.
+    """
     twists = np.column_stack([r.reshape(-1, 3), t.reshape(-1, 3)])
     return np.vstack([np.zeros(6), twists])[views.scanners.of_view]
 

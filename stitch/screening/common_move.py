@@ -25,8 +25,10 @@ _SIDE_VIEWS, _TARGETS = 3, 8
 _BELIEVED = 2 * np.log(1000.0)
 # A move of fewer times what the arm errs is a doubt only.
 _SURE_TIMES = 3.0
-# Solutions on the way to the move that fits best.
+# Gauss–Newton rounds at the most on the way to the move that fits best.
 _STEPS = 12
+# Lag-1 correlation of neighbouring views at the most: beyond it hardly any view would count as independent.
+_MOST_CORRELATED = 0.95
 
 
 def find_common_move(capture: Capture) -> "CommonMove | None":
@@ -45,18 +47,18 @@ def find_common_move(capture: Capture) -> "CommonMove | None":
     if not fits:
         return None
     # A move that begins after the last view is none.
-    one = min((fit.solved([count]) for fit in fits), key=lambda fit: fit.total)
+    unmoved = min((fit.solved([count]) for fit in fits), key=lambda fit: fit.total)
     starts = list(range(_SIDE_VIEWS, count - _SIDE_VIEWS + 1))
-    two = max((fit.solved(starts) for fit in [*fits, one]), key=lambda fit: one.evidence_of(fit))
+    moved = max((fit.solved(starts) for fit in [*fits, unmoved]), key=unmoved.deviance_drop_to)
     price = 6 * np.log(count) + 2 * np.log(len(starts)) + _BELIEVED
-    return two if one.evidence_of(two) > price else None
+    return moved if unmoved.deviance_drop_to(moved) > price else None
 
 
 def _thinned(s: Sightings) -> Sightings:
-    """Return sightings with some targets a view, those that most views show."""
+    """Return sightings with at most `_TARGETS` targets in each view, those that most views show."""
     rank = np.argsort(np.argsort(-s.view_counts, kind="stable"))[s.target]
-    of_view = np.argsort(np.argsort(np.where(s.used, rank, len(s.targets)), axis=1), axis=1)
-    return replace(s, used=s.used & (of_view < _TARGETS))
+    place_in_view = np.argsort(np.argsort(np.where(s.used, rank, len(s.targets)), axis=1), axis=1)
+    return replace(s, used=s.used & (place_in_view < _TARGETS))
 
 
 def _starts(capture: Capture) -> Iterator[Array]:
@@ -91,7 +93,11 @@ class CommonMove:
     def __init__(self, capture: Capture, T_mount: Array, T: Array | None = None, start: int | None = None) -> None:
         """Place all labelled points, those from view `start` on with the base moved by T (4, 4).
 
-        `rest` (N, 3), length_unit, is what each point is off the mean of its target. None: no motion, no view.
+        `rest` (N, 3), length_unit, is what each point is off the mean of its target, reference frame.
+
+        Args:
+            T: motion of the base, in its own frame; None: it does not move.
+            start: number of the first view after the motion; None: no view is.
         """
         self.capture, self.T_mount = capture, T_mount
         self.T = np.eye(4) if T is None else T
@@ -112,14 +118,14 @@ class CommonMove:
 
     @property
     def moved(self) -> float:
-        """By how much, rms over what the sensor shows, length_unit."""
+        """How far the points after the motion moved by it, rms, length_unit."""
         after = self.in_base[self.view >= self.start]
-        apart = after - frames.transform(frames.inverse(self.T), after)
-        return float(np.sqrt(np.sum(apart**2) / len(apart)))
+        displacement = after - frames.transform(frames.inverse(self.T), after)
+        return float(np.sqrt(np.sum(displacement**2) / len(displacement)))
 
     @property
     def is_sure(self) -> bool:
-        """False where the arm errs as much."""
+        """True where the motion is more than `_SURE_TIMES` what the arm errs."""
         return self.moved > _SURE_TIMES * np.sqrt(self.total / len(self.rest))
 
     def shows(self, capture: Capture) -> Mask:
@@ -129,11 +135,12 @@ class CommonMove:
         middles = np.full((len(s.targets), 3), np.nan)
         for k in np.unique(self.target):
             middles[k] = self.placed[self.target == k].mean(axis=0)
-        apart = []
+        distances = []
         for T in (np.eye(4), self.T):
-            off = np.linalg.norm(_placed(capture, self.T_mount, T, s)[1] - middles[s.target], axis=2)
-            apart.append(np.where(s.used, np.nan_to_num(off), 0.0).sum(axis=1))
-        return apart[1] < apart[0]
+            of_points = np.linalg.norm(_placed(capture, self.T_mount, T, s)[1] - middles[s.target], axis=2)
+            distances.append(np.where(s.used, np.nan_to_num(of_points), 0.0).sum(axis=1))
+        unmoved, moved = distances
+        return moved < unmoved
 
     def solved(self, starts: list[int]) -> "CommonMove":
         """Return the move with the least sum of squares among those that begin at one of `starts`, views.
@@ -160,60 +167,70 @@ class CommonMove:
         centroid = p.mean(axis=0)
         base_centroid = self.in_base.mean(axis=0)
         size = float(np.linalg.norm(p - centroid, axis=1).mean()) or 1.0
-        to_reference = (
-            np.broadcast_to(np.eye(3), (len(p), 3, 3))
-            if self.capture.scanner_rides
-            else self.capture.T_reference_mount[self.view, :3, :3]
-        )
+        # Rotations that carry a displacement: of the mount to the base, of the base to the reference frame.
         moved = (self.view >= self.start)[:, None, None]
-        of_base = np.where(moved, self.T[:3, :3], np.eye(3))
-        carried = self.capture.T_reference_mount[self.view, :3, :3]
-        to_base = of_base @ carried if self.capture.scanner_rides else of_base
+        to_base = np.where(moved, self.T[:3, :3], np.eye(3))
+        to_reference = np.broadcast_to(np.eye(3), to_base.shape)
+        R_reference_mount = self.capture.T_reference_mount[self.view, :3, :3]
+        if self.capture.scanner_rides:
+            to_base = to_base @ R_reference_mount
+        else:
+            to_reference = R_reference_mount
         of_mount = to_reference @ to_base @ self.T_mount[:3, :3]
         rows = [of_mount @ -frames.skew((p - centroid) / size), of_mount]
         rows += [moved * (to_reference @ -frames.skew((self.in_base - base_centroid) / size)), moved * to_reference]
         columns = self._centred(np.concatenate(rows, axis=2)).reshape(-1, 12)
         x = np.linalg.lstsq(columns, -self.rest.ravel(), rcond=1e-8)[0]
-        turn = np.repeat([1 / size, 1.0], 3)
+        # Rotations were counted in displacements at a distance of `size`.
+        unit = np.repeat([1 / size, 1.0], 3)
         about, about_base = frames.make(np.eye(3), centroid), frames.make(np.eye(3), base_centroid)
-        T_mount = self.T_mount @ about @ frames.exp(turn * x[:6]) @ frames.inverse(about)
-        T = about_base @ frames.exp(turn * x[6:]) @ frames.inverse(about_base) @ self.T
+        T_mount = self.T_mount @ about @ frames.exp(unit * x[:6]) @ frames.inverse(about)
+        T = about_base @ frames.exp(unit * x[6:]) @ frames.inverse(about_base) @ self.T
         return CommonMove(self.capture, T_mount, T, self.start)
 
     def _centred(self, rows: Array) -> Array:
-        """Return rows (N, 3, c) less the mean of their target's."""
+        """Return rows (N, 3, c) of the points, each less the mean over the points of its target."""
         sums = np.zeros((len(self.sightings.targets), *rows.shape[1:]))
         np.add.at(sums, self.target, rows)
         count = np.maximum(np.bincount(self.target, minlength=len(sums)), 1)
         return rows - (sums / count[:, None, None])[self.target]
 
-    def _view_squares(self) -> tuple[Array, Array, Array]:
-        """Return the mean residual (V, 3) of each view, the squares (3, 3) of the means, and those of what is left.
-
-        What is left are residuals about their view's mean, each over the number of points in the view.
-        """
+    def _view_means(self) -> Array:
+        """Return the mean residual (V, 3) of each view, reference frame; zero for a view without points."""
         count = np.bincount(self.view, minlength=len(self.sightings.points))
         means = np.zeros((len(count), 3))
         np.add.at(means, self.view, self.rest)
         means /= np.maximum(count, 1)[:, None]
-        left = self.rest - means[self.view]
-        return means, means.T @ means, (left / count[self.view, None]).T @ left
+        return means
 
-    def evidence_of(self, other: "CommonMove") -> float:
-        """Return by how much −2 log likelihood falls from this fit to another one.
+    def _squares(self, means: Array) -> tuple[Array, Array]:
+        """Return the squares (3, 3) of the views' means (V, 3), and of residuals about them over their view's count."""
+        count = np.bincount(self.view, minlength=len(means))
+        within = self.rest - means[self.view]
+        return means.T @ means, (within / count[self.view, None]).T @ within
+
+    def deviance_drop_to(self, other: "CommonMove") -> float:
+        """Return by how much −2 log likelihood falls from this fit to another one, whose residuals say how views err.
 
         It is n·d·log of the ratio of squares, for the means of the views and for residuals about them. n counts
-        independent views: neighbours with like errors count as fewer. d counts the directions in which errors scatter.
+        independent views, d the directions in which errors scatter: an error of one joint has one.
         """
-        means, *squares = other._view_squares()
-        own = self._view_squares()[1:]
-        following = float(np.sum(means[1:] * means[:-1])) / max(float(np.sum(means**2)), 1e-300)
-        memory = float(np.clip(following, 0.0, 0.95))
-        views = (len(means) - 3) * (1 - memory) / (1 + memory)
-        fall = 0.0
-        for before, after in zip(own, squares, strict=True):
-            # Directions that scatter: an error of one joint has one.
-            dimensions = np.trace(after) ** 2 / max(float(np.sum(after**2)), 1e-300)
+        means = other._view_means()
+        drop = 0.0
+        for before, after in zip(self._squares(self._view_means()), other._squares(means), strict=True):
+            # Participation ratio of the eigenvalues, (Σ λ)² / Σ λ².
+            directions = np.trace(after) ** 2 / max(float(np.sum(after**2)), 1e-300)
             if np.trace(after) > 0:
-                fall += dimensions * float(np.log(np.trace(before) / np.trace(after)))
-        return views * fall
+                drop += directions * float(np.log(np.trace(before) / np.trace(after)))
+        return _independent_views(means) * drop
+
+
+def _independent_views(means: Array) -> float:
+    """Return how many independent views tell as much as V neighbouring ones whose mean residuals (V, 3) are alike.
+
+    It is (V − 3)(1 − ρ)/(1 + ρ) with the lag-1 correlation ρ, the sample size of a first-order autoregressive process.
+    The mean over the views takes three numbers.
+    """
+    correlation = float(np.sum(means[1:] * means[:-1])) / max(float(np.sum(means**2)), 1e-300)
+    correlation = float(np.clip(correlation, 0.0, _MOST_CORRELATED))
+    return (len(means) - 3) * (1 - correlation) / (1 + correlation)

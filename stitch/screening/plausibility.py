@@ -29,7 +29,7 @@ _NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8:
 _DOUBTED_FROM, _MOST_ODDS, _LIKELY_VIEW = 0.5, 1000.0, 0.9
 # Views that are named as farthest off.
 _LISTED = 3
-# Rounding explains a scatter of no more than so many times what it makes, and no less than its part.
+# Rounding explains a scatter that differs from what it makes by no more than this factor, up or down.
 _TIMES_ROUNDING = 2.0
 # Of a step: numbers that are whole within this were rounded. By chance one row in thousands is.
 _WHOLE = 2e-3
@@ -93,38 +93,48 @@ def suspicion_in_words(session: SessionData, view: MisplacedView) -> str:
 
 
 def snooping_warnings(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """Return session-level warnings: background in the scans, steps between views, implausible pose errors.
+    """Return warnings about the session as a whole: one about pose errors at the most, then background, then steps.
 
     Args:
+        snooping: the outlier tests of every view's pose (data snooping).
         T_mount: (4, 4) hand-eye under which `snooping` was made.
     """
+    pose_errors = _pose_error_warning(session, capture, snooping, T_mount)
     background = (found.fix for found in background_problems(session, capture, T_mount, snooping))
     steps = (step.describe(session.names, session.length_unit) for step in snooping.steps)
-    warnings = (*background, *steps)
+    return (*([pose_errors] if pose_errors else []), *background, *steps)
+
+
+def _pose_error_warning(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str | None:
+    """Return the first of three warnings about pose errors that applies, or None.
+
+    1. Rounding of the table explains the scatter: then neither the arm nor any view is to blame.
+    2. The poses scatter beyond what effects of an arm do: then odds against an ordinary arm mean nothing.
+    3. The views are too few to tell, or one of few is off (`check_few_views`).
+    """
     rounding = rounding_that_explains(session, snooping)
     if rounding is not None:
-        return (f"{rounding.describe()}.", *warnings)
+        return f"{rounding.describe()}."
     if scatters_beyond_effects(session, snooping):
-        return (_implausible_scatter(session, capture, snooping, T_mount), *warnings)
-    few = check_few_views(session, snooping)
-    return warnings if few is None else (few, *warnings)
+        return _implausible_scatter(session, capture, snooping, T_mount)
+    return check_few_views(session, snooping)
 
 
 def background_problems(
     session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
 ) -> list[SessionProblem]:
-    """Return the problems of what the scans show beside the part: background that stands still, or things in the way.
+    """Return what the scans show beside the part, as problems: background that stands still, or things in the way.
 
-    The second are only asked if there is no background, and no view is left out or displaced.
+    Things in the way are only sought if there is no background, and no view is left out or displaced.
 
     Args:
         T_mount: (4, 4) hand-eye under which `snooping` was made.
     """
     size = part_size([capture])
     names = session.names
-    still = find_static_background(capture.scans, capture.poses(T_mount), snooping.tolerance, size)
-    if still is not None:
-        share, views, box, within = still
+    background = find_static_background(capture.scans, capture.poses(T_mount), snooping.tolerance, size)
+    if background is not None:
+        share, views, box, within = background
         sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *box, strict=True))
         how = f"cut {', '.join(sides)} {session.length_unit} out of the scans"
         if within is not None:
@@ -152,15 +162,15 @@ def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snoop
     model_poses = capture.poses(T_mount)
     twists = frames.log(snooping.unconstrained.poses @ frames.inverse(model_poses))
     middles = np.array([points.mean(axis=0) for points in capture.visible_points])
-    placed = frames.transform(model_poses, middles[:, None])[:, 0]
-    moved = np.linalg.norm(twists[:, 3:] + np.cross(twists[:, :3], placed), axis=1)
-    worst = [v for v in np.argsort(-moved) if v not in snooping.left_out][:_LISTED]
-    farthest = ", ".join(f"{session.names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
+    in_reference = frames.transform(model_poses, middles[:, None])[:, 0]
+    displacement = np.linalg.norm(twists[:, 3:] + np.cross(twists[:, :3], in_reference), axis=1)
+    worst = [v for v in np.argsort(-displacement) if v not in snooping.left_out][:_LISTED]
+    farthest = ", ".join(f"{session.names[v]} ({displacement[v]:.3g} {session.length_unit})" for v in worst)
     return sentence("implausible scatter", by=scatter_in_words(session, snooping), farthest=farthest)
 
 
 def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
-    """Return a warning of a session of few views, or None.
+    """Return a warning that few views cannot show a wrong pose, or that one of them may be wrong; None without either.
 
     There are four: no test is possible; the views overlap too little; one view is off, by odds against ordinary errors
     of an arm; the same, and which one it is. None if a view is left out, if there are enough views for the tests, or if
