@@ -309,11 +309,8 @@ class LiveSession:
         it among the others, and all views are tested again: older ones may turn out to be wrong and leave the fit.
         Last, the fall of the hand-eye's U (k = 2) tells whether the view adds anything.
         """
-        original = self._original_of(view)
-        if original is not None:
-            same = np.allclose(original.T_base_flange, view.T_base_flange, rtol=0.0, atol=1e-9)
-            why = f"Its scan is a copy of that of {original.name}, at {'the same' if same else 'another'} pose."
-            return self._report(view, "adds_nothing" if same else "does_not_belong", why)
+        if (verdict_on_copy := self._judge_copy(view)) is not None:
+            return verdict_on_copy
         if self._fit is None:
             return self._first_fit(view)
         before = self.hand_eye
@@ -341,17 +338,19 @@ class LiveSession:
         self._fit = fit_live_hand_eye(self._fit, self._errors)
         others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in blunders.items())
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
-        idle = seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not blunders
+        is_idle = seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not blunders
         share = f"{100 * seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
-        return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
+        return self._report(view, "adds_nothing" if is_idle else "fits", f"{others} {share}".strip())
 
-    def _original_of(self, view: View) -> View | None:
-        """Return the first earlier view whose scan has exactly the same points; None where there is none."""
+    def _judge_copy(self, view: View) -> LiveView | None:
+        """Return the verdict on a view whose scan has exactly the points of an earlier one; None for any other view."""
         assert view.cloud is not None
-        clouds = [before.cloud for before in self.session.views[:-1]]
-        same = (i for i, cloud in enumerate(clouds) if cloud and np.array_equal(cloud.points, view.cloud.points))
-        first = next(same, None)
-        return None if first is None else self.session.views[first]
+        for original in self.session.views[:-1]:
+            if original.cloud and np.array_equal(original.cloud.points, view.cloud.points):
+                same = np.allclose(original.T_base_flange, view.T_base_flange, rtol=0.0, atol=1e-9)
+                why = f"Its scan is a copy of that of {original.name}, at {'the same' if same else 'another'} pose."
+                return self._report(view, "adds_nothing" if same else "does_not_belong", why)
+        return None
 
     def _first_fit(self, view: View) -> LiveView:
         """Try the first fit of the hand-eye from the views so far, and return the verdict on the last one, `view`.
@@ -433,13 +432,17 @@ class LiveSession:
 
         From `_IN_A_ROW` rejected views in a row on, the sentence `why` also names their probable common cause.
         """
-        # Rejected views at the end of `said`, and this one.
-        row = 1
-        while row <= len(self.said) and self.said[-row].verdict == "does_not_belong":
-            row += 1
-        if row >= _IN_A_ROW:
-            first = self.said[len(self.said) - row + 1].name
-            why += f" The part or the scanner has probably moved: the last {row} views do not belong, from {first} on."
+        # This view and the rejected ones at the end of `said`.
+        rejected = [view.name]
+        for said in reversed(self.said):
+            if said.verdict != "does_not_belong":
+                break
+            rejected.append(said.name)
+        if len(rejected) >= _IN_A_ROW:
+            why += (
+                f" The part or the scanner has probably moved: the last {len(rejected)} views do not belong, from "
+                f"{rejected[-1]} on."
+            )
         return self._report(view, "does_not_belong", why)
 
     def _report(self, view: View, verdict: Verdict, why: str) -> LiveView:

@@ -555,9 +555,10 @@ def _labelled_columns(session: SessionData) -> tuple[TableColumns | None, TableC
         return None, None
     sigma = np.concatenate([sighting.sigma for sighting in seen.values()])
     if all(sighting.rotation is None for sighting in seen.values()):
-        named = [(name, target) for name, sighting in seen.items() for target in sighting.targets]
+        views = [name for name, sighting in seen.items() for _ in sighting.targets]
+        targets = [target for sighting in seen.values() for target in sighting.targets]
         places = np.concatenate([sighting.points for sighting in seen.values()])
-        columns = dict(zip(("view", "target", "x", "y", "z"), (*zip(*named, strict=True), *places.T), strict=True))
+        columns = {"view": views, "target": targets, **dict(zip("xyz", places.T, strict=True))}
         return columns | _known("sigma", sigma), None
     rotations = [np.eye(3) if sighting.rotation is None else sighting.rotation for sighting in seen.values()]
     T = frames.make(np.array(rotations), np.array([sighting.points[0] for sighting in seen.values()]))

@@ -72,7 +72,7 @@ def run(
         >>> run.hand_eye.pose.shape
         (4, 4)
     """
-    others = None if recorder is None else [recorder]
+    recorders = None if recorder is None else [recorder]
     sessions = [session] if isinstance(session, SessionData | str | Path) else session
     if isinstance(sessions, Sequence) and len(sessions) > 1:
         _require_sessions(sessions)
@@ -82,7 +82,7 @@ def run(
                 'one scanner, or [scanner] name = "left" in each session.toml'
             )
         sessions = [join_scanners(sessions, *_models(model, arm))]
-    return run_rig(sessions, model, others, effects, keep, arm, register, progress)[0]
+    return run_rig(sessions, model, recorders, effects, keep, arm, register, progress)[0]
 
 
 def run_rig(
@@ -114,8 +114,7 @@ def run_rig(
         True
     """
     _require_sessions(sessions)
-    others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
-    replays = [ReplayRecorder(other, progress) for other in others]
+    replays = [ReplayRecorder(recorder, progress) for recorder in recorders or [None] * len(sessions)]
     known_model, kept_arm = _models(model, arm)
     known_effects = [find_effect(name).name for name in _names(effects)]
     runs = pipeline.run_rig(sessions, known_model, replays, known_effects, keep, kept_arm, register=register)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -218,26 +219,18 @@ def _follow_session(folder: Path, views: int | None) -> None:
     line = f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}."
     say(line, stream=sys.stderr)
     live: LiveSession | None = None
-    failed = _Failures()
+    failures = _Failures()
     try:
         while views is None or live is None or len(live.said) < views:
-            try:
-                session = load_session(folder, scans=False) if table.is_file() else None
-            except InputError as error:
-                failed.note(error.command_line)
-                session = None
+            session = failures.attempt(partial(load_session, folder, scans=False)) if table.is_file() else None
             if session is not None:
                 live = live or follow(session)
-                for name in session.names:
-                    if name in live.session.names:
-                        continue
-                    try:
-                        view = load_session(folder, only=name).views[0]
-                    except InputError as error:
-                        failed.note(error.command_line)
+                for name in [name for name in session.names if name not in live.session.names]:
+                    one = failures.attempt(partial(load_session, folder, only=name))
+                    if one is None:
                         break
-                    say(str(live.take(view)))
-                    failed = _Failures()
+                    say(str(live.take(one.views[0])))
+                    failures = _Failures()
             time.sleep(_EVERY)
     except KeyboardInterrupt:
         if live is None:
@@ -250,20 +243,24 @@ def _follow_session(folder: Path, views: int | None) -> None:
 class _Failures:
     """Prints why reading fails, once for each reason, and only after `_PATIENCE` seconds of failures.
 
-    A new object is made after each success.
+    A new object is made after each view that was judged.
     """
 
     def __init__(self) -> None:
         self._since: float | None = None
         self._said = ""
 
-    def note(self, message: str) -> None:
-        """Note one failure, and print the message if reading has failed for long and it was not printed last."""
-        now = time.monotonic()
-        self._since = self._since or now
-        if now - self._since > _PATIENCE and message != self._said:
-            say(f"waiting: {message}", stream=sys.stderr)
-            self._said = message
+    def attempt(self, load: Callable[[], SessionData]) -> SessionData | None:
+        """Return the session that `load` reads; None where it fails, which is printed once it has failed for long."""
+        try:
+            return load()
+        except InputError as error:
+            now = time.monotonic()
+            self._since = self._since or now
+            if now - self._since > _PATIENCE and error.command_line != self._said:
+                self._said = error.command_line
+                say(f"waiting: {self._said}", stream=sys.stderr)
+            return None
 
 
 def _current_session() -> Path:

@@ -141,14 +141,14 @@ def _heights(places: Array, points: Array, normals: Array, tree: Any, size: floa
         facing = np.array([column.take(index) for column in normal_columns])
         away = np.array([at - column.take(index) for column, at in zip(point_columns, block.T, strict=True)])
         # Normals that face away belong to the other side of a thin sheet: their weight is zero.
-        agree = np.maximum(np.einsum("ikp,ip->kp", facing, facing[:, 0]), 0)
-        weight = agree * np.exp((distance[0] ** 2 - distance**2) / size**2)
+        cosine = np.maximum(np.einsum("ikp,ip->kp", facing, facing[:, 0]), 0)
+        weight = cosine * np.exp((distance[0] ** 2 - distance**2) / size**2)
         weight /= weight.sum(axis=0)
-        here = np.einsum("kp,ikp->ip", weight, facing)
-        here /= np.sqrt(np.einsum("ip,ip->p", here, here))
-        # `here` is the normal at the place. Tangent planes at the points lie above a convex surface, one at the place
-        # below it: on a ball the mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
-        facing += here[:, None]
+        mean = np.einsum("kp,ikp->ip", weight, facing)
+        mean /= np.sqrt(np.einsum("ip,ip->p", mean, mean))
+        # Tangent planes at the points lie above a convex surface, one at the place with the mean normal below it: on a
+        # ball the mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
+        facing += mean[:, None]
         return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", facing, away)) / 2, distance[0]
 
     blocks = parallel(heights_of, np.array_split(places, len(places) // _IN_CACHE + 1), "blocks of the mesh")

@@ -20,7 +20,7 @@ from stitch.model.model import EffectsCovariance, Target
 from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.observations.scanner_places import ScannerAlone
+from stitch.observations.scanner_places import ScannerAlone, ScannerPlace
 from stitch.observations.surfaces.hand_eye_fit import Repeatability, capture_repeatability
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.outliers import Outlier, mask_outliers
@@ -47,7 +47,7 @@ from stitch.output.schema import (
 from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
 from stitch.session.measurement import Measurement
 from stitch.session.scan import Stock
-from stitch.session.session import SessionData, View
+from stitch.session.session import Scanner, SessionData, View
 from stitch.system.packages import stitch_version
 
 _PACKAGES = ("numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
@@ -343,9 +343,9 @@ def _pose_sigma(run: RunData, name: str) -> Array:
     method = method_named(run.register_method)
     covariance = pose_covariance(run.registered, capture, run.poses, run.T_mount, scatter, method)
     middle = frames.transform(run.poses[view], capture.scans[view].points.mean(axis=0)[None])[0]
-    against = np.where(np.arange(count) == view, 1.0, -1 / (count - 1))
-    moved = np.kron(against, frames.adjoint(frames.make(np.eye(3), run.registered.gram.centre - middle)))
-    return np.sqrt(np.diag(moved @ covariance @ moved.T))
+    weights = np.where(np.arange(count) == view, 1.0, -1 / (count - 1))
+    A = np.kron(weights, frames.adjoint(frames.make(np.eye(3), run.registered.gram.centre - middle)))
+    return np.sqrt(np.diag(A @ covariance @ A.T))
 
 
 def stock_of_views(document: dict[str, Any], names: Sequence[str]) -> dict[int, Stock]:
@@ -378,28 +378,14 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
     """
     common = model_of(run)
     documents = {}
-    for k, (part, row) in enumerate(zip(run.session.parts, whole["scanners"], strict=True)):
+    for part, place, row in zip(run.session.parts, run.scanners, whole["scanners"], strict=True):
         name = part.scanner.name
-        effects = {
-            effect.removesuffix(f"@{name}"): parameters
-            for effect, parameters in common.effects.items()
-            if effect != SCANNER_PLACEMENT and effect.partition("@")[2] in ("", name)
-        }
-        place = run.scanners[k]
-        model = replace(
-            common,
-            T_mount=place.T_mount,
-            T_mount_coarse=place.T_mount if part.scanner.T_mount is None else part.scanner.T_mount,
-            covariance=place.covariance,
-            effects=effects,
-            effects_covariance=EffectsCovariance(),
-            scanners={},
-        )
+        model = _model_of_scanner(common, part.scanner, place)
         own_entries = {
             "session": str(part.path.resolve()),
             "name": part.name,
             "hand_eye_coarse": plain(model.T_mount_coarse),
-            "effects": {e: {p: parameter_row(value) for p, value in table.items()} for e, table in effects.items()},
+            "effects": {e: {p: parameter_row(x) for p, x in table.items()} for e, table in model.effects.items()},
             "hand_eye_stated": False,
             **{key: value for key, value in row.items() if key not in ("session", "alone", "U")},
             "views": _own_rows(whole["views"], name),
@@ -410,6 +396,29 @@ def scanner_documents(run: RunData, whole: dict[str, Any]) -> dict[str, tuple[di
         of_all = ("sessions", "scanners", "effects_covariance", "hand_eye_sigma_anywhere")
         documents[part.name] = ({k: v for k, v in whole.items() if k not in of_all} | own_entries, model)
     return documents
+
+
+def _model_of_scanner(common: ModelFile, scanner: Scanner, place: ScannerPlace) -> ModelFile:
+    """Return the model of one scanner of a joined run: its hand-eye `place`, and the effects of it or of all.
+
+    Args:
+        common: model of the joined run.
+        scanner: as its own session states it.
+    """
+    effects = {
+        effect.removesuffix(f"@{scanner.name}"): parameters
+        for effect, parameters in common.effects.items()
+        if effect != SCANNER_PLACEMENT and effect.partition("@")[2] in ("", scanner.name)
+    }
+    return replace(
+        common,
+        T_mount=place.T_mount,
+        T_mount_coarse=place.T_mount if scanner.T_mount is None else scanner.T_mount,
+        covariance=place.covariance,
+        effects=effects,
+        effects_covariance=EffectsCovariance(),
+        scanners={},
+    )
 
 
 def _own_rows(rows: list[dict[str, Any]], scanner: str) -> list[dict[str, Any]]:

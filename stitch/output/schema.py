@@ -127,7 +127,7 @@ class Document:
         }
 
     def fields(self, document: dict[str, Any], of: type | None = None) -> dict[str, Any]:
-        """Return what a document holds for the fields of a class, read, by the names of the fields.
+        """Return field -> value, read by its kind, of the keys of a document that fill the fields of a class.
 
         A key that is optional or conditional may be absent; then its field is too, and the class has a default.
 

@@ -22,10 +22,10 @@ def axes_of(session: SessionData) -> Axes:
         return Axes()
     readings = np.array([axis_readings(session.axes, v.covariates, session.length_unit) for v in session.views])
     readings = readings.reshape(len(session.views), len(session.axes))
-    moved = np.sign(np.diff(readings, axis=0, prepend=readings[:1]))
-    stated = zip(session.views, moved, strict=True)
-    approach = np.array([m if v.axis_approach is None else v.axis_approach for v, m in stated])
-    approach = np.reshape(approach, readings.shape)
+    approach = np.sign(np.diff(readings, axis=0, prepend=readings[:1]))
+    for v, view in enumerate(session.views):
+        if view.axis_approach is not None:
+            approach[v] = view.axis_approach
     return Axes(session.axes, readings, approach, session.has_poses, session.length_unit)
 
 
@@ -88,7 +88,8 @@ def place_stated_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData
     """
     if session.has_poses or not axes:
         return place_axes(session, axes)
-    frame_axis = axes[Axes(tuple(axes), has_robot=False).frame_axis]
+    k = Axes(tuple(axes), has_robot=False).frame_axis
+    frame_axis = axes[k]
     T_axis_scanner = session.scanner.T_mount
     if frame_axis.is_placed:
         if T_axis_scanner is not None:
@@ -96,25 +97,23 @@ def place_stated_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData
                 f"{session.path}: axis {frame_axis.name} and scanner.pose both state where the axis stands; to "
                 "fix: take one out"
             )
-        T_scanner_axis = frame_axis.frame
-        T_axis_scanner = frames.inverse(T_scanner_axis)
+        T_axis_scanner = frames.inverse(frame_axis.frame)
         session = replace(session, scanner=replace(session.scanner, T_mount=T_axis_scanner))
-    placed = []
-    for axis in axes:
-        if axis is frame_axis:
-            origin = np.zeros(3) if axis.is_rotary else None
-            axis = replace(axis, direction=np.array([0.0, 0.0, 1.0]), point=origin)
-        elif T_axis_scanner is None:
-            axis = replace(axis, direction=None, point=None)
-        elif axis.direction is not None:
-            axis = _moved_axis(axis, T_axis_scanner)
-        placed.append(axis)
+    placed = [_axis_in_frame(axis, T_axis_scanner) for axis in axes]
+    origin = np.zeros(3) if frame_axis.is_rotary else None
+    placed[k] = replace(frame_axis, direction=np.array([0.0, 0.0, 1.0]), point=origin)
     return place_axes(session, placed)
 
 
-def _moved_axis(axis: Axis, T_new_old: Array) -> Axis:
-    """Return an axis of known direction in another frame: T_new_old (4, 4) maps its present frame into that one."""
-    assert axis.direction is not None
+def _axis_in_frame(axis: Axis, T_new_old: Array | None) -> Axis:
+    """Return an axis in another frame: T_new_old (4, 4) maps its present frame into that one; None: it is unplaced.
+
+    An axis without a direction stays as it is.
+    """
+    if T_new_old is None:
+        return replace(axis, direction=None, point=None)
+    if axis.direction is None:
+        return axis
     point = None if axis.point is None else frames.transform(T_new_old, axis.point[None])[0]
     return replace(axis, direction=T_new_old[:3, :3] @ axis.direction, point=point)
 
@@ -130,17 +129,17 @@ def axis_tables(session: SessionData) -> list[dict[str, Any]]:
     Without a robot they are written in the scanner's frame, and without a place where the hand-eye is not known.
     """
     tables = []
-    T_scanner_axis = None
-    if not session.has_poses and session.scanner.T_mount is not None:
-        T_scanner_axis = frames.inverse(session.scanner.T_mount)
     for axis in session.axes:
         table: dict[str, Any] = {"name": axis.name, "kind": axis.kind, "carries": axis.carries}
-        if T_scanner_axis is not None and axis.direction is not None:
-            axis = _moved_axis(axis, T_scanner_axis)
-        if axis.direction is not None and (session.has_poses or T_scanner_axis is not None):
+        if not session.has_poses:
+            T_mount = session.scanner.T_mount
+            axis = _axis_in_frame(axis, None if T_mount is None else frames.inverse(T_mount))
+        if axis.direction is not None:
             table["direction"] = axis.direction.tolist()
-            table |= {} if axis.point is None else {"point": axis.point.tolist()}
-            table |= {"stated": True} if axis.is_fixed else {}
+            if axis.point is not None:
+                table["point"] = axis.point.tolist()
+            if axis.is_fixed:
+                table["stated"] = True
         tables.append(table)
     return tables
 

@@ -195,18 +195,10 @@ def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> 
     graph.nodes.extend([registration.PoseGraphNode(T) for T in start])
     for i, j in _one_sided(clouds, start):
         T = frames.inverse(start[i]) @ start[j]
-        if registration.evaluate_registration(shown[j], shown[i], _DISTANCES[0] * spacing, T).fitness < _OVERLAP:
-            continue
-        for distance in _DISTANCES:
-            last = distance == _DISTANCES[-1]
-            loss = registration.TukeyLoss(k=_ROBUST * spacing) if last else registration.L2Loss()
-            method = registration.TransformationEstimationPointToPlane(loss)
-            T = registration.registration_icp(shown[j], shown[i], distance * spacing, T, method).transformation
-        information = registration.get_information_matrix_from_point_clouds(
-            shown[j], shown[i], _DISTANCES[-1] * spacing, T
-        )
-        # An edge of Open3D leads from its source to its target.
-        graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=False))
+        if registration.evaluate_registration(shown[j], shown[i], _DISTANCES[0] * spacing, T).fitness >= _OVERLAP:
+            T, information = _register_pair(registration, shown[j], shown[i], T, spacing)
+            # An edge of Open3D leads from its source to its target.
+            graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=False))
     linked = {v for edge in graph.edges for v in (edge.source_node_id, edge.target_node_id)}
     if len(linked) < len(clouds):
         raise NoResultError("--with open3d: Open3D finds no pair for some view; there is nothing to compare")
@@ -219,6 +211,24 @@ def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> 
         ),
     )
     return np.array([node.pose for node in graph.nodes]), len(graph.edges)
+
+
+def _register_pair(registration: Any, source: Any, target: Any, T: Array, spacing: float) -> tuple[Array, Array]:
+    """Return T_target_source (4, 4) by point-to-plane ICP from coarse to fine, and its information matrix (6, 6).
+
+    Args:
+        registration: the module of Open3D.
+        source, target: clouds of Open3D with normals.
+        T: (4, 4) T_target_source at which it begins.
+        spacing: of the points, length_unit.
+    """
+    for distance in _DISTANCES:
+        is_last = distance == _DISTANCES[-1]
+        loss = registration.TukeyLoss(k=_ROBUST * spacing) if is_last else registration.L2Loss()
+        method = registration.TransformationEstimationPointToPlane(loss)
+        T = registration.registration_icp(source, target, distance * spacing, T, method).transformation
+    reach = _DISTANCES[-1] * spacing
+    return T, registration.get_information_matrix_from_point_clouds(source, target, reach, T)
 
 
 def _one_sided(clouds: list[Array], poses: Array) -> list[tuple[int, int]]:

@@ -343,7 +343,7 @@ class _CorrespondenceRows:
             scale: robust sigma of their distances, length_unit.
         """
         self.count = len(poses)
-        parts: list[list[Array]] = [[], [], [], [], [], []]
+        parts = list[tuple[Array, ...]]()
         for m in matches:
             inside = np.abs(m.residual) < RMS_GATE * scale
             for sign, v, w, index in ((1.0, m.v, m.w, m.index_v), (-1.0, m.w, m.v, m.index_w)):
@@ -351,10 +351,8 @@ class _CorrespondenceRows:
                 points = state.measurement.capture.scans[v].points[index[inside]]
                 cosine = state.measurement.scan_views[v].cosine[index[inside]]
                 views = np.full(size, v), np.full(size, w)
-                values = (*views, sign * m.residual[inside], points, cosine, m.middle[inside])
-                for part, value in zip(parts, values, strict=True):
-                    part.append(value)
-        view, partner, self.residual, points, cosine, self.place = (np.concatenate(p) for p in parts)
+                parts.append((*views, sign * m.residual[inside], points, cosine, m.middle[inside]))
+        view, partner, self.residual, points, cosine, self.place = map(np.concatenate, zip(*parts, strict=True))
         self.view, self.partner = view.astype(np.int64), partner.astype(np.int64)
         x, y, z = points.T
         self.properties = [
@@ -393,8 +391,8 @@ class _OffsetRows:
         landmarks = initial_landmarks(capture, T_mount, drawing_of(state.session.nominal, sightings))
         rows = target_rows(capture, T_mount, landmarks)
         covariance = (rows.noise + rows.fixed)[:, :, None] * np.eye(rows.residual.shape[1])
-        nothing = np.zeros(rows.landmarks.shape[2])
-        placed = BlockLeastSquares(-rows.residual, rows.landmarks, covariance, nothing, nothing).solve()
+        no_prior = np.zeros(rows.landmarks.shape[2])
+        placed = BlockLeastSquares(-rows.residual, rows.landmarks, covariance, no_prior, no_prior).solve()
         residual = rows.residual + rows.landmarks @ placed
         used = sightings.used
         self.count = len(used)
@@ -427,8 +425,8 @@ class _OffsetRows:
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     """Return the table of views by name; sigmas and p-values are NaN, since each bin is a single sample, its view."""
     table = _labelled_table("view", names, rows.statistics(rows.view, len(names)))
-    nothing = np.full(len(names), np.nan)
-    return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
+    unknown = np.full(len(names), np.nan)
+    return replace(table, mean_sigma=unknown, rms_sigma=unknown, p_value=unknown)
 
 
 def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
@@ -441,15 +439,15 @@ def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
     counts, sums, squares = (by_bin[0] for by_bin in rows.sums(one_bin, 1))
     v, w = np.nonzero(np.triu(counts, 1))
     count = counts[v, w]
-    nothing = np.full(len(v), np.nan)
+    unknown = np.full(len(v), np.nan)
     statistics = BinStatistics(
         mean=sums[v, w] / count,
-        mean_sigma=nothing,
+        mean_sigma=unknown,
         rms=np.sqrt(squares[v, w] / count),
-        rms_sigma=nothing,
+        rms_sigma=unknown,
         count=count,
         views=np.full(len(v), 2),
-        p_value=nothing,
+        p_value=unknown,
     )
     return _labelled_table("pair", [f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)], statistics)
 

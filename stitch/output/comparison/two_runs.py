@@ -77,7 +77,10 @@ class HandEyeChange:
     @property
     def p_value(self) -> float:
         """Return the p-value of so large a twist under the stated uncertainties; NaN where none is stated."""
-        if not np.isfinite(self.covariance).all() or not (rank := np.linalg.matrix_rank(self.covariance)):
+        if not np.isfinite(self.covariance).all():
+            return float("nan")
+        rank = np.linalg.matrix_rank(self.covariance)
+        if rank == 0:
             return float("nan")
         return chi2_tail(float(self.twist @ np.linalg.pinv(self.covariance) @ self.twist), float(rank))
 

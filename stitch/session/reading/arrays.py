@@ -16,7 +16,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.reading.clouds import cloud_of_columns
 from stitch.session.reading.depth_image import points_of_image
-from stitch.session.reading.intrinsics import Intrinsics, intrinsics_of_level
+from stitch.session.reading.intrinsics import Intrinsics, intrinsics_of_mapping
 from stitch.session.reading.scan_files import measured_pixels
 from stitch.session.reading.text_files import require_name
 from stitch.session.session import Cloud, Sighting
@@ -66,21 +66,21 @@ def _columns(item: Any, where: str) -> Columns:
         normals = {} if cloud.normals is None else dict(zip(_NORMALS, cloud.normals.T, strict=True))
         return dict(zip("xyz", cloud.points.T, strict=True)) | normals | cloud.scalars
     if isinstance(item, Mapping):
-        return _of_mapping(item, where)
+        return _mapping_columns(item, where)
     if isinstance(item, tuple) and len(item) == 2 and not isinstance(item[0], (int, float)):
-        return _of_depth(*item, where)
+        return _depth_columns(*item, where)
     library = type(item).__module__.split(".")[0]
     if library == "open3d":
-        return _of_open3d(item, where)
+        return _open3d_columns(item, where)
     if library == "trimesh" and hasattr(item, "vertices"):
         colours = getattr(item, "colors", None)
         has_colours = colours is not None and len(colours) > 0
-        return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if has_colours else {})
+        return _xyz_columns(np.asarray(item.vertices), where) | (_colour_columns(colours, where) if has_colours else {})
     array = _unmasked(item)
     if array.dtype.names is not None:
         columns = {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
         return measured_pixels(columns)
-    columns = _points(array, where)
+    columns = _xyz_columns(array, where)
     return measured_pixels(columns) if array.ndim == 3 or np.ma.isMaskedArray(item) else columns
 
 
@@ -99,7 +99,7 @@ def _unmasked(values: Any) -> Any:
     return filled
 
 
-def _points(points: Array, where: str) -> Columns:
+def _xyz_columns(points: Array, where: str) -> Columns:
     """Return columns x, y, z of points (N, 3), or of all pixels of (H, W, 3), NaN included.
 
     Raises:
@@ -110,19 +110,19 @@ def _points(points: Array, where: str) -> Columns:
     return dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
 
 
-def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
+def _mapping_columns(item: Mapping[str, Any], where: str) -> Columns:
     """Return the columns of a mapping: three each from points, normals and colors, one from every other entry.
 
     Raises:
         InputError: columns of different lengths.
     """
     rest = {str(name): _unmasked(values) for name, values in item.items()}
-    columns = _points(rest.pop("points"), where) if "points" in rest else {}
+    columns = _xyz_columns(rest.pop("points"), where) if "points" in rest else {}
     count = len(columns.get("x", ()))
     if "normals" in rest:
-        columns |= _triple(_NORMALS, rest.pop("normals"), "normals", where)
+        columns |= _three_columns(_NORMALS, rest.pop("normals"), "normals", where)
     if "colors" in rest:
-        columns |= _colours(rest.pop("colors"), where)
+        columns |= _colour_columns(rest.pop("colors"), where)
     columns |= {name: values.ravel() for name, values in rest.items()}
     odd = next((name for name, column in columns.items() if len(column) != (count or len(columns[name]))), None)
     if odd is not None:
@@ -130,7 +130,7 @@ def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
     return measured_pixels(columns)
 
 
-def _colours(colours: Any, where: str) -> Columns:
+def _colour_columns(colours: Any, where: str) -> Columns:
     """Return columns red, green, blue, 0 … 255, of colours (..., 3 or 4): integers as they are, floats times 255.
 
     A fourth value, the opacity, is left out.
@@ -138,17 +138,17 @@ def _colours(colours: Any, where: str) -> Columns:
     values = np.asarray(colours)
     if values.dtype.kind == "f":
         values = np.round(values * 255)
-    return _triple(_COLOURS, values[..., :3], "colors", where)
+    return _three_columns(_COLOURS, values[..., :3], "colors", where)
 
 
-def _triple(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
+def _three_columns(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
     """Return three columns by their names from values (..., 3); `what` names them in the error."""
     if values.ndim < 2 or values.shape[-1] != 3:
         raise InputError(f"{where}: {what} of shape {values.shape}; to fix: pass three numbers a point")
     return dict(zip(names, values.reshape(-1, 3).T, strict=True))
 
 
-def _of_open3d(item: Any, where: str) -> Columns:
+def _open3d_columns(item: Any, where: str) -> Columns:
     """Return the columns of a PointCloud of Open3D: of open3d.geometry, or of open3d.t.geometry with its attributes.
 
     Raises:
@@ -157,25 +157,25 @@ def _of_open3d(item: Any, where: str) -> Columns:
     if hasattr(item, "depth"):
         raise InputError(f"{where}: an image has no points without its lens; to fix: pass (image, intrinsics)")
     if hasattr(item, "has_normals"):
-        columns = _points(np.asarray(item.points), where)
-        columns |= _triple(_NORMALS, np.asarray(item.normals), "normals", where) if item.has_normals() else {}
-        return columns | (_colours(item.colors, where) if item.has_colors() else {})
+        columns = _xyz_columns(np.asarray(item.points), where)
+        columns |= _three_columns(_NORMALS, np.asarray(item.normals), "normals", where) if item.has_normals() else {}
+        return columns | (_colour_columns(item.colors, where) if item.has_colors() else {})
     if "positions" not in getattr(item, "point", ()):
         raise InputError(f"{where}: {type(item).__name__} is no cloud that is known; to fix: pass {_KNOWN}")
     values = {name: item.point[name].cpu().numpy() for name in item.point}
     values = {"intensity" if name == "intensities" else name: x for name, x in values.items()}
     threes = {"points": values.pop("positions")} | {k: values.pop(k) for k in ("normals", "colors") if k in values}
-    return _of_mapping(threes | {name: x for name, x in values.items() if x.size == len(x)}, where)
+    return _mapping_columns(threes | {name: x for name, x in values.items() if x.size == len(x)}, where)
 
 
-def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
+def _depth_columns(image: Any, intrinsics: Any, where: str) -> Columns:
     """Return the columns of the points of a depth image, with brightness or colours of an RGB-D image of its size.
 
     Args:
         image: (H, W) array or image of depths, or an RGBDImage; 0 where nothing was measured.
         intrinsics: as `_intrinsics` takes them.
     """
-    depth = _pixels(getattr(image, "depth", image))
+    depth = _image_pixels(getattr(image, "depth", image))
     colour = getattr(image, "color", None)
     if depth.ndim != 2:
         raise InputError(
@@ -184,15 +184,15 @@ def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
     points = points_of_image(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
     measured = np.isfinite(points[:, 2])
     columns = dict(zip("xyz", points[measured].T, strict=True))
-    pixels = np.zeros(0) if colour is None else _pixels(colour)
+    pixels = np.zeros(0) if colour is None else _image_pixels(colour)
     if pixels.shape[:2] != depth.shape:
         return columns
     if pixels.ndim == 2:
         return columns | {"intensity": pixels.ravel()[measured]}
-    return columns | {name: values[measured] for name, values in _colours(pixels, where).items()}
+    return columns | {name: values[measured] for name, values in _colour_columns(pixels, where).items()}
 
 
-def _pixels(image: Any) -> Array:
+def _image_pixels(image: Any) -> Array:
     """Return the pixels (H, W), or (H, W, C) of C > 1 channels, of an array or of an image of Open3D."""
     for way in ("as_tensor", "cpu"):
         image = getattr(image, way)() if hasattr(image, way) else image
@@ -217,8 +217,8 @@ def _intrinsics(item: Any, where: str) -> Intrinsics:
         item = {"camera_matrix": item.intrinsic_matrix} | size
     elif not isinstance(item, Mapping):
         item = {"camera_matrix": item.cpu().numpy() if hasattr(item, "cpu") else item}
-    level = {str(name).lower(): _plain(value) for name, value in item.items()}
-    intrinsics = intrinsics_of_level(Path(where), level)
+    mapping = {str(name).lower(): _plain(value) for name, value in item.items()}
+    intrinsics = intrinsics_of_mapping(Path(where), mapping)
     if intrinsics is None:
         raise InputError(
             f"{where}: the intrinsics are no matrix (3, 3) with focal lengths; to fix: pass fx, fy, cx, cy in pixels"

@@ -92,31 +92,31 @@ def _read_intrinsics(file: Path) -> Intrinsics | None:
             document = documents[0] if documents else None
     except (ValueError, RecursionError, InputError):
         return None
-    cameras = (intrinsics_of_level(file, level) for level in _document_levels(document))
+    cameras = (intrinsics_of_mapping(file, mapping) for mapping in _mappings_in(document))
     return next((camera for camera in cameras if camera is not None), None)
 
 
-def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
+def _mappings_in(document: Any) -> Iterator[dict[str, Any]]:
     """Yield every mapping of a document at any depth, keys in small letters; inner ones named after depth first."""
     if isinstance(document, dict):
         plain = {str(key).lower(): value for key, value in document.items()}
         yield plain
         for key in sorted(plain, key=lambda key: "depth" not in key):
-            yield from _document_levels(plain[key])
+            yield from _mappings_in(plain[key])
 
 
-def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
+def intrinsics_of_mapping(file: Path, mapping: dict[str, Any]) -> Intrinsics | None:
     """Return the camera, or the pitch of a height map, that one mapping states; None where it states neither.
 
     Args:
         file: for messages.
-        level: a mapping of a document, with keys in small letters.
+        mapping: of a document, with keys in small letters.
 
     Raises:
         InputError: numbers that no lens has.
     """
-    matrix = _camera_matrix(level)
-    named = {m[2] or m[3]: level[name] for name in level if (m := _PITCH.match(name))} if matrix is None else {}
+    matrix = _camera_matrix(mapping)
+    named = {m[2] or m[3]: mapping[name] for name in mapping if (m := _PITCH.match(name))} if matrix is None else {}
     if {"x", "y"} <= named.keys() and all(isinstance(step, (int, float)) and step > 0 for step in named.values()):
         pitch = (float(named["x"]), float(named["y"]), float(named.get("z", 1.0)))
         return Intrinsics(file, 1.0, 1.0, 0.0, 0.0, np.zeros(0), None, None, pitch)
@@ -127,24 +127,24 @@ def intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
         raise InputError(
             f"{file}: fx = {fx:g}, fy = {fy:g} are no focal lengths; to fix: state them in pixels, above 0"
         )
-    width = _whole_number(level, "width", "image_width")
-    height = _whole_number(level, "height", "image_height")
+    width = _whole_number(mapping, "width", "image_width")
+    height = _whole_number(mapping, "height", "image_height")
     size = None if width is None or height is None else (width, height)
-    distortion = _distortion(file, level)
-    return Intrinsics(file, fx, fy, cx, cy, distortion, size, units_per_metre=_units_per_metre(file, level))
+    distortion = _distortion(file, mapping)
+    return Intrinsics(file, fx, fy, cx, cy, distortion, size, units_per_metre=_units_per_metre(file, mapping))
 
 
-def _camera_matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
+def _camera_matrix(mapping: dict[str, Any]) -> tuple[float, float, float, float] | None:
     """Return fx, fy, cx, cy, pixels, of a mapping that names them or holds a camera matrix; None where it has none."""
-    inner = level.get("cameramatrix")
+    inner = mapping.get("cameramatrix")
     if isinstance(inner, dict):
-        level = {str(key).lower(): value for key, value in inner.items()}
+        mapping = {str(key).lower(): value for key, value in inner.items()}
     for names in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")):
-        if all(isinstance(level.get(name), (int, float)) for name in names):
-            fx, fy, cx, cy = (float(level[name]) for name in names)
+        if all(isinstance(mapping.get(name), (int, float)) for name in names):
+            fx, fy, cx, cy = (float(mapping[name]) for name in names)
             return fx, fy, cx, cy
     for name, by_columns in (("camera_matrix", False), ("k", False), ("intrinsic_matrix", True)):
-        K = _list_numbers(level.get(name))
+        K = _list_numbers(mapping.get(name))
         if len(K) == 9:
             K = K.reshape(3, 3)
             # Open3D writes by columns: its last row 0 0 1 tells.
@@ -163,22 +163,22 @@ def _list_numbers(value: Any) -> Array:
         return np.zeros(0)
 
 
-def _distortion(file: Path, level: dict[str, Any]) -> Array:
+def _distortion(file: Path, mapping: dict[str, Any]) -> Array:
     """Return OpenCV's distortion k1, k2, p1, p2, k3 (5,), or (0,) where the lens has none.
 
     Raises:
         InputError: the numbers are those of another law.
     """
-    inner = level.get("distortion")
+    inner = mapping.get("distortion")
     if isinstance(inner, dict):
         named = {str(key).lower(): value for key, value in inner.items()}
         distortion = np.array([float(named.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")])
     else:
         names = ("distortion_coefficients", "coeffs", "d", "distortion")
-        distortion = next((x for name in names if len(x := _list_numbers(level.get(name)))), np.zeros(0))
+        distortion = next((x for name in names if len(x := _list_numbers(mapping.get(name)))), np.zeros(0))
     if not distortion.any():
         return np.zeros(0)
-    law = str(level.get("distortion_model", level.get("model", "")))
+    law = str(mapping.get("distortion_model", mapping.get("model", "")))
     if re.search("inverse|modified|kannala|fish.?eye|equidistant|theta", law, re.IGNORECASE):
         raise InputError(
             f"{file}: the lens distorts by {law}, its numbers are not OpenCV's k1, k2, p1, p2, k3; to fix: "
@@ -187,11 +187,11 @@ def _distortion(file: Path, level: dict[str, Any]) -> Array:
     return distortion
 
 
-def _whole_number(level: dict[str, Any], *names: str) -> int | None:
-    return next((int(level[name]) for name in names if isinstance(level.get(name), (int, float))), None)
+def _whole_number(mapping: dict[str, Any], *names: str) -> int | None:
+    return next((int(mapping[name]) for name in names if isinstance(mapping.get(name), (int, float))), None)
 
 
-def _units_per_metre(file: Path, level: dict[str, Any]) -> float | None:
+def _units_per_metre(file: Path, mapping: dict[str, Any]) -> float | None:
     """Return how many units of depth make a metre; None where the file does not say it.
 
     `depth_scale` may be that number, as 1000, or its inverse, as 0.001.
@@ -199,7 +199,7 @@ def _units_per_metre(file: Path, level: dict[str, Any]) -> float | None:
     Raises:
         InputError: a value in between, which could be neither.
     """
-    value = level.get("depth_scale")
+    value = mapping.get("depth_scale")
     if value is None:
         return None
     if isinstance(value, (int, float)) and value >= _PER_METRE:

@@ -95,7 +95,8 @@ def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) ->
         return columns
     index = np.full(len(pixels.lengths), -1)
     measured = pixels.lengths > 0
-    index[measured] = pixels.values[(np.cumsum(pixels.lengths) - pixels.lengths)[measured]]
+    first = np.cumsum(pixels.lengths) - pixels.lengths  # where each pixel's list begins among all values
+    index[measured] = pixels.values[first[measured]]
     return {
         name: np.where(index >= 0, np.asarray(column, float)[index], np.nan if name in "xyz" else 0.0)
         for name, column in columns.items()
