@@ -120,10 +120,9 @@ def _rivals(diagnosis: Diagnosis, ranked: Ranked) -> list[dict[str, Any]]:
     odds = {c.name: c.ranked.log_posterior for c in diagnosis.candidates if c.ranked.score.observable}
     odds |= {law_of(law).words: law.log_posterior for law in diagnosis.laws}
     odds["nothing"] = ranked.log_posterior - ranked.log_odds_over_nothing
-    others = sorted(
-        ((log_posterior, what) for what, log_posterior in odds.items() if what != ranked.name), reverse=True
-    )
-    return [{"what": what, "log_odds": ranked.log_posterior - other} for other, what in others[:_RIVALS]]
+    del odds[ranked.name]
+    likeliest = sorted(((other, what) for what, other in odds.items()), reverse=True)[:_RIVALS]
+    return [{"what": what, "log_odds": ranked.log_posterior - other} for other, what in likeliest]
 
 
 def _parameters(score: Score) -> dict[str, Any]:
