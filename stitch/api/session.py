@@ -374,17 +374,17 @@ def _measured_views(cell: Session, names: list[str], scans: list[Any], points: A
     metres = METRES[cell.length_unit]
     scale = METRES[cloud_unit] / metres
 
-    def cloud(at: int) -> Cloud | None:
+    def cloud_of_view(v: int) -> Cloud | None:
         """Return the checked cloud of one view, None where it has no scan."""
-        if scans[at] is None:
+        if scans[v] is None:
             return None
-        where = f"view {names[at]}"
-        read = partial(cloud_of, scans[at], where, scale)
-        scan = checked_scan(names[at], where, read, metres=metres, scanner=cell.scanner, at_most=MAX_POINTS)
+        where = f"view {names[v]}"
+        read = partial(cloud_of, scans[v], where, scale)
+        cloud = checked_scan(names[v], where, read, metres=metres, scanner=cell.scanner, at_most=MAX_POINTS)
         # A small scan is the session's own; a large one stays with whoever holds it.
-        return replace(scan, points=scan.points.copy()) if scan.points is scans[at] else scan
+        return replace(cloud, points=cloud.points.copy()) if cloud.points is scans[v] else cloud
 
-    clouds = list(parallel(cloud, range(len(names)), "reading scans"))
+    clouds = list(parallel(cloud_of_view, range(len(names)), "reading scans"))
     return [
         View(
             name=name,

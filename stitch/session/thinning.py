@@ -51,12 +51,12 @@ def points_within(memory: float, views: int) -> int:
 def thin_session(session: SessionData, at_most: int = MAX_POINTS) -> tuple[SessionData, Capture]:
     """Return a session with at most `at_most` points a view, evenly over the scan order, and its capture."""
 
-    def of_view(view: View) -> View:
+    def thinned(view: View) -> View:
         if view.cloud is None:
             return view
         return replace(view, cloud=thin_cloud(view.name, view.cloud, at_most, session.scanner))
 
-    session = replace(session, views=tuple(parallel(of_view, session.views)))
+    session = replace(session, views=tuple(parallel(thinned, session.views)))
     return session, prepare_capture(session)
 
 

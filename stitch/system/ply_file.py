@@ -206,8 +206,8 @@ def _read_binary_lists(stream: BinaryIO, element: _Element, order: str) -> Colum
     """
     start = stream.tell()
     data = stream.read()
-    first, _ = _walk_rows(data, replace(element, count=min(element.count, 1)), order)
-    lengths = {name: int(column.lengths.sum()) for name, column in first.items() if isinstance(column, Lists)}
+    first_row, _ = _walk_rows(data, replace(element, count=min(element.count, 1)), order)
+    lengths = {name: int(column.lengths.sum()) for name, column in first_row.items() if isinstance(column, Lists)}
     layout = np.dtype(_fields_of_row(element, order, lengths))
     if layout.itemsize * element.count <= len(data):
         rows: NDArray[np.void] = np.frombuffer(data, layout, element.count)
@@ -217,7 +217,7 @@ def _read_binary_lists(stream: BinaryIO, element: _Element, order: str) -> Colum
                 name: Lists(rows[f"{name} length"].astype(np.int64), rows[name].reshape(-1))
                 if name in lengths
                 else rows[name]
-                for name in first
+                for name in first_row
             }
     columns, size = _walk_rows(data, element, order)
     stream.seek(start + size)

@@ -129,29 +129,31 @@ def open3d_witness(run: RunData) -> Witness:
     if len(clouds) < len(run.session.views):
         raise NoResultError("--with open3d: labelled points are no clouds; there is nothing for Open3D to register")
     clouds = [np.ascontiguousarray(points[:: max(1, len(points) // _POINTS)], float) for points in clouds]
-    apart = float(np.median([spacing(points, KDTree(points)) for points in clouds]))
+    point_spacing = float(np.median([spacing(points, KDTree(points)) for points in clouds]))
     with _one_thread(o3d):
-        poses, pairs = _registered(o3d, clouds, run.poses_model, apart)
+        poses, pairs = _registered(o3d, clouds, run.poses_model, point_spacing)
         normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
+    # The common rigid motion that no scan can tell is taken off.
     poses = align_points(_placed(clouds, poses), _placed(clouds, run.poses)) @ poses
-    difference = frames.inverse(run.poses) @ poses
+    T_run_open3d = frames.inverse(run.poses) @ poses  # of each view, scanner frame
     middles = np.array([points.mean(axis=0) for points in clouds])
-    moved = np.array([frames.transform(T, m[None])[0] - m for T, m in zip(difference, middles, strict=True)])
-    placed = _placed(clouds, poses)
-    placed_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
-    fused, fused_normals = run.fused.points, run.fused.normals
-    asked = fused[:: max(1, len(fused) // _ASKED)]
+    shifts = np.array([frames.transform(T, m[None])[0] - m for T, m in zip(T_run_open3d, middles, strict=True)])
+    its_points = _placed(clouds, poses)
+    its_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
+    our_points = run.fused.points
+    its_sample = its_points[:: max(1, len(its_points) // _ASKED)]
+    our_sample = our_points[:: max(1, len(our_points) // _ASKED)]
     return Witness(
         version=next(d.version for d in distributions() if (d.metadata["Name"] or "").lower() in _PACKAGES),
         views=tuple(run.session.names),
         poses=poses,
-        shift=np.linalg.norm(moved, axis=1),
-        turn=np.linalg.norm(frames.log(difference)[:, :3], axis=1),
+        shift=np.linalg.norm(shifts, axis=1),
+        turn=np.linalg.norm(frames.log(T_run_open3d)[:, :3], axis=1),
         pairs=pairs,
-        to_run=_from_surface(placed[:: max(1, len(placed) // _ASKED)], fused, fused_normals),
-        from_run=_from_surface(asked, placed, placed_normals),
-        places=asked,
-        overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * apart),
+        to_run=_from_surface(its_sample, our_points, run.fused.normals),
+        from_run=_from_surface(our_sample, its_points, its_normals),
+        places=our_sample,
+        overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * point_spacing),
     )
 
 

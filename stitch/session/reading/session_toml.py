@@ -170,10 +170,10 @@ def _read_pose(file: Path, value: Any) -> Array:
         T = np.empty(0)
     if T.shape != (4, 4) or not (np.abs(T) < LARGEST).all():
         raise InputError(f"{file}: scanner.pose is no 4×4 matrix; to fix: write four rows of four numbers")
-    off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
-    if off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+    deviation = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
+    if deviation > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise InputError(
-            f"{file}: scanner.pose is not a rigid motion (R·Rᵀ differs from 1 by {off:.2g}, "
+            f"{file}: scanner.pose is not a rigid motion (R·Rᵀ differs from 1 by {deviation:.2g}, "
             f"det {np.linalg.det(T[:3, :3]):+.3f}); write a rotation, and 0 0 0 1 in the last row"
         )
     return frames.make(frames.nearest_rotation(T[:3, :3]), T[:3, 3])
