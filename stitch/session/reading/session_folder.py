@@ -5,7 +5,7 @@ Every check of input is made here or in the readers called: session.toml, tables
 
 import csv
 import hashlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -89,9 +89,8 @@ def load_session(
     within = read_crop_box(file, document.get("scanner", {}))
     views = [row.view for row in rows]
     if scans:
-        sightings = _read_sightings(path, {view.name for view in views})
         clouds = read_scans(path, rows, unit, cloud_unit, scanner, within=within, at_most=at_most)
-        views = [_measured_view(path, row, cloud, sightings) for row, cloud in zip(rows, clouds, strict=True)]
+        views = _measured_views(path, rows, clouds)
     cad, cad_unit = cad_file(file, document.get("part", {}))
     session = SessionData(
         path=path,
@@ -139,23 +138,26 @@ def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:
     return read_frames(frames, known) if frames.is_file() else {}
 
 
-def _measured_view(path: Path, row: ViewRow, cloud: Cloud | None, sightings: Mapping[str, Sighting]) -> View:
-    """Return the view of a row with its cloud and its labelled points.
+def _measured_views(path: Path, rows: Sequence[ViewRow], clouds: Iterable[Cloud | None]) -> list[View]:
+    """Return the views of rows with their clouds, and with their labelled points from points.csv or frames.csv.
 
     Args:
-        path: the session's folder, for the message.
-        cloud: its scan; None: it has none.
-        sightings: view -> labelled points, of all views.
+        path: the session's folder.
+        clouds: the scan of each row; None: it has none.
 
     Raises:
-        InputError: no cloud, in a session without labelled points.
+        InputError: a table that cannot be read, or a view without a cloud in a session without labelled points.
     """
-    if cloud is None and not sightings:
-        raise InputError(
-            f"{path / 'views.csv'} line {row.line}: view {row.view.name} names no cloud; fill the column "
-            "cloud, or put points.csv or frames.csv beside it"
-        )
-    return replace(row.view, cloud=cloud, sighting=sightings.get(row.view.name))
+    sightings = _read_sightings(path, {row.view.name for row in rows})
+    views = []
+    for row, cloud in zip(rows, clouds, strict=True):
+        if cloud is None and not sightings:
+            raise InputError(
+                f"{path / 'views.csv'} line {row.line}: view {row.view.name} names no cloud; fill the column "
+                "cloud, or put points.csv or frames.csv beside it"
+            )
+        views.append(replace(row.view, cloud=cloud, sighting=sightings.get(row.view.name)))
+    return views
 
 
 def _read_nominal(path: Path, views: Sequence[View]) -> NominalTargets | None:
