@@ -447,14 +447,18 @@ def _clocks() -> Iterator[Case]:
 
 def _others() -> Iterator[Case]:
     """Folders for init that hold something else, histories of cells that are none, links and ports."""
-    # The other five are a session; the sixth is said to be left out.
     command, german = ["init", "raw", "--yes"], _PREPARE["german_folder"]
-    spoil = _changed("raw", lambda raw: (raw / "v002.ply").write_text(""), command, german)
-    yield Case("folders for init", "an empty cloud", spoil, writes=("raw/",), right=_poses_right)
+    for name, change in {
+        # The other five are a session; the sixth is said to be left out.
+        "an empty cloud": lambda raw: (raw / "v002.ply").write_text(""),
+        # Either says the same; the other is said to be left aside.
+        "a table twice": lambda raw: shutil.copy(raw / "Posen.csv", raw / "Posen2.csv"),
+    }.items():
+        spoil = _changed("raw", change, command, german)
+        yield Case("folders for init", name, spoil, writes=("raw/",), right=_poses_right)
     for name, change in {
         "no clouds": lambda raw: [file.unlink() for file in raw.glob("*.ply")],
         "no poses": lambda raw: (raw / "Posen.csv").unlink(),
-        "two tables": lambda raw: shutil.copy(raw / "Posen.csv", raw / "Posen2.csv"),
         "a session there": lambda raw: (raw / "session.toml").write_text("x"),
         "a link in a circle": lambda raw: (raw / "again").symlink_to(raw),
     }.items():
