@@ -446,9 +446,11 @@ class LiveSession:
         return self._report(view, "does_not_belong", why)
 
     def _report(self, view: View, verdict: Verdict, why: str) -> LiveView:
+        """Return what is said of a view, with the hand-eye so far; `_take` fills in the seconds."""
         return LiveView(view.name, verdict, why, self.hand_eye, 0.0)
 
     def _session_of(self, members: list[int]) -> Session:
+        """Return the session with those of its views alone, by index."""
         return replace(self.session, views=tuple(self.session.views[i] for i in members))
 
     def _errors(

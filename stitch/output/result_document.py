@@ -284,6 +284,7 @@ def _target_rows(run: RunData) -> list[dict[str, Any]]:
 
 
 def _sizes(distances: Array) -> dict[str, float]:
+    """Return mean, median and largest of distances, length_unit, without those that are NaN."""
     known = distances[np.isfinite(distances)]
     return {"mean": float(known.mean()), "median": float(np.median(known)), "max": float(known.max())}
 
@@ -302,6 +303,7 @@ def _has_labelled_alone(run: RunData) -> bool:
 
 
 def _has_points_and_clouds(run: RunData) -> bool:
+    """Return whether labelled points count beside the surfaces of clouds."""
     return run.targets is not None and run.overlaps is not None
 
 

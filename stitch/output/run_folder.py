@@ -350,6 +350,7 @@ def write_model_with_effects(run: RunData, folder: Path) -> None:
 
 
 def _write_points(run: RunData, folder: Path) -> None:
+    """Write stitched.ply and, where pyarrow is installed, residuals.parquet into a folder."""
     write_cloud(run.fused, folder / "stitched.ply")
     with unless_missing():
         write_residuals(run, folder / "residuals.parquet")

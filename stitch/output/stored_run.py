@@ -259,6 +259,7 @@ def _require_same(folder: Path, document: dict[str, Any], model: ModelFile, run:
 
 
 def _fused_views(document: dict[str, Any], run: RunData) -> list[results.ViewRow]:
+    """Return the rows of result.json of the views that the run has not left out."""
     excluded = {item.view for item in run.left_out}
     return [row for row in results.view_rows(document) if row.view not in excluded]
 

@@ -92,11 +92,13 @@ class Views:
 
     @property
     def _gravity_in_flange(self) -> Array:
+        """Gravity as unit vectors (V, 3) in the flange frame."""
         down = self.gravity[None] if self.gravity.ndim == 1 else self.gravity[:, None]
         return frames.rotate(frames.inverse(self.T_base_flange), down)[:, 0]
 
     @property
     def _gravity_in_base(self) -> Array:
+        """Gravity as unit vectors (V, 3) in the base frame, or in that of the part which axes carry."""
         return np.tile(self.gravity, (self.count, 1)) if self.gravity.ndim == 1 else self.gravity
 
     def at_scanner(self, twists: Array) -> Array:

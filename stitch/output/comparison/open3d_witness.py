@@ -111,6 +111,7 @@ class Witness:
 
 
 def _summary(distance: Array) -> dict[str, float]:
+    """Return median and 95 % quantile of |distance| (N,), and the mean of the signed distances, length_unit."""
     median, p95 = np.quantile(np.abs(distance), [0.5, 0.95])
     return {"median": float(median), "p95": float(p95), "mean": float(distance.mean())}
 

@@ -164,6 +164,7 @@ def _find_picture(scan: Path) -> Path | None:
 
 
 def _read_picture(file: Path) -> NDArray[np.uint8]:
+    """Return the brightness (H, W), 0 to 255, of a picture, with colours or without."""
     from PIL import Image
 
     with Image.open(file) as image:

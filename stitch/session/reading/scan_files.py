@@ -165,6 +165,7 @@ def _columns_of_heights(head: list[str], rows: list[list[str]]) -> dict[str, Arr
 
 
 def _column_names(line: str, separator: str | None) -> list[str]:
+    """Return the cells of a line, X, Y and Z in small letters; a separator of None: they are separated by blanks."""
     cells = [cell.strip() for cell in line.split(separator)]
     return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]
 

@@ -135,6 +135,11 @@ def _target_rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str,
 
 
 def _require_view(file: Path, line: int, view: str, known: Collection[str]) -> None:
+    """Refuse the name of a view that views.csv does not have.
+
+    Raises:
+        InputError: names the line.
+    """
     if view not in known:
         raise InputError(
             f"{file} line {line}: view {shortened(view)} is not in views.csv; add it there or remove the row"

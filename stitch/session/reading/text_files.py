@@ -75,6 +75,14 @@ def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
 
 
 def _require_size(file: Path, hint: str, largest_mb: float) -> None:
+    """Refuse a file that cannot be read, or that is larger than so many MB.
+
+    Args:
+        hint: what to do where there is no such file.
+
+    Raises:
+        InputError: as `require_file`, or the file is too large.
+    """
     require_file(file, hint)
     size = file.stat().st_size / 1e6
     if size > largest_mb:

@@ -249,6 +249,7 @@ def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, 
 
 
 def _may_be_covariate(column: str) -> bool:
+    """Return whether a column of views.csv has no meaning of its own, as poses, joints and times have."""
     return column not in {"view", "cloud", "time_s", *POSE_COLUMNS} and not (
         _JOINT.match(column) or _APPROACH.match(column)
     )

@@ -68,6 +68,7 @@ def _value(file: Path, event: yaml.Event, events: Iterator[yaml.Event], depth: i
 
 
 def _scalar(event: yaml.ScalarEvent) -> float | str | None:
+    """Return a single value as a number if Python reads one, else as text; None where it is empty, without quotes."""
     if event.style:  # in quotes
         return str(event.value)
     return float(event.value) if is_number(event.value) else event.value or None
