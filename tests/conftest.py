@@ -152,12 +152,15 @@ def session(_blade_on_disk, tmp_path):
     return Path(shutil.copytree(_blade_on_disk, tmp_path / "s"))
 
 
+FEW = ("joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash")
+
+
 @pytest.fixture(scope="session")
 def library_of():
-    """A context in which the library holds some effects alone."""
+    """A context in which the library holds some effects alone, a few of joints unless they are named."""
 
     @contextmanager
-    def only(names):
+    def only(names=FEW):
         whole = dict(EFFECTS)
         for name in whole.keys() - set(names):
             del EFFECTS[name]
@@ -169,12 +172,9 @@ def library_of():
     return only
 
 
-FEW = ("joint_offset", "joint_compliance", "gear_eccentricity", "gear_harmonic", "backlash")
-
-
 @pytest.fixture
 def few_effects(monkeypatch, library_of):
     """A small library: what is tested is the choice, not how long all of it takes."""
     monkeypatch.setattr(candidates, "empirical_effects", lambda views: [])
-    with library_of(FEW):
+    with library_of():
         yield

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import stitch
-from data_synth.made_session import make
+from data_synth.fixtures.blade_cells import measured_blade
 from stitch.numerics import frames
 from tests.plugins.intake.test_ros_bag import Messages
 
@@ -25,7 +25,7 @@ MM = 1e-3
 
 @pytest.fixture(scope="module")
 def measured():
-    return make("blade-table", {}, seed=3, views=VIEWS)
+    return measured_blade(0, views=VIEWS, mount="eye_in_hand", pixels=50)
 
 
 def in_metres(T):

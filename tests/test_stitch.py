@@ -366,7 +366,14 @@ def members_of(value, depth=3):
 
 
 @pytest.fixture(scope="module")
-def values(tmp_path_factory):
+def small_library(library_of):
+    """Few effects: what is tested is what holds them."""
+    with library_of(("joint_offset", "joint_compliance", "backlash", "range_scale")):
+        yield
+
+
+@pytest.fixture(scope="module")
+def values(tmp_path_factory, small_library):
     """An object of every class that public names hand out, by its name: those that others hold are found there."""
     folder = tmp_path_factory.mktemp("values")
     cell = measured_blade(0, views=8, mount="eye_in_hand", pixels=30)

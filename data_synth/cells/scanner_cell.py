@@ -24,7 +24,7 @@ NAMES = ("left", "right")
 # What is hidden at amplitude 1: a share of the range, mm per ρ².
 SIZES = {"range_scale": 5e-4, "field_curvature": 1.0}
 _ARM_SCATTER = np.repeat([20e-6, 0.02], 3)
-_SCANNER = Scanner(columns=110, rows=110, noise=0.02, standoff=420.0, depth_of_field=500.0, field_error=0.006)
+_SCANNER = Scanner(noise=0.02, standoff=420.0, depth_of_field=500.0, field_error=0.006)
 # Of a scanner's scale, as data sheets have it.
 _SCALE = 2e-4
 
@@ -42,13 +42,17 @@ class ScannerCell:
 
 
 def scanner_cell(
-    kind: str, seed: int, hidden: dict[str, tuple[int, float]] | None = None, views: int = 10
+    kind: str, seed: int, hidden: dict[str, tuple[int, float]] | None = None, views: int = 10, rays: int = 110
 ) -> ScannerCell:
-    """Simulate a cell; `hidden` has by name of the law whose scanner errs, and times what it does at amplitude 1."""
+    """Simulate a cell, of `rays` × `rays` a scan.
+
+    `hidden` has by name of the law whose scanner errs, and times what it does at amplitude 1.
+    """
+    scanner = replace(_SCANNER, columns=rays, rows=rays)
     rng = np.random.default_rng([seed, KINDS.index(kind), 2])
     mesh = build_shape("blade")
     middle = np.asarray(mesh.bounds.mean(axis=0))
-    weights = [field_map(_SCANNER, rng) for _ in NAMES]
+    weights = [field_map(scanner, rng) for _ in NAMES]
     scales = 1 + rng.normal(0, _SCALE, 2)
     turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix()
     on_flange = np.array([0.0, 0.0, 120.0]) + rng.normal(0, 8.0, 3)
@@ -72,7 +76,7 @@ def scanner_cell(
                 flange = T_holder_part @ look @ np.linalg.inv(T_mount[0])
                 T_part_scanner = np.linalg.inv(T_holder_part) @ flange @ off @ T_mount[k]
             flanges[k, v] = flange
-            cloud = scan(mesh, T_part_scanner, _SCANNER, weights[k], rng)
+            cloud = scan(mesh, T_part_scanner, scanner, weights[k], rng)
             cloud = replace(cloud, points=cloud.points * scales[k])
             clouds[k].append(_erring(cloud, k, hidden or {}))
     stated = [

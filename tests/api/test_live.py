@@ -3,6 +3,8 @@
 import shutil
 import threading
 import time
+from contextlib import suppress
+from copy import copy
 
 import numpy as np
 import pytest
@@ -12,13 +14,19 @@ from stitch.cli.main import main
 
 
 @pytest.fixture(scope="module")
-def live_blade(arrays):
-    """The cell's views, taken one by one."""
-    live = stitch.live(mount="eye_in_hand", name="s")
-    clouds, poses = arrays
-    for cloud, pose in zip(clouds, poses, strict=True):
+def after_four(arrays):
+    """The first four views, taken one by one: there is a hand-eye."""
+    live = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(arrays[0][:4], arrays[1], strict=False):
         live.add_view(cloud, pose)
     return live
+
+
+def branch(live):
+    """A live session that goes on from another, which stays as it is: nothing that it holds is changed in place."""
+    own = copy(live)
+    own.said = list(live.said)
+    return own
 
 
 def test_the_end_is_that_of_a_batch_to_the_last_bit(live_blade, arrays):
@@ -40,11 +48,9 @@ def test_views_wait_until_there_are_enough(live_blade):
     assert all(said.hand_eye is None for said in live_blade.said[:3])
 
 
-def test_a_knocked_view_is_named_when_it_comes_and_the_next_ones_say_since_when(arrays):
+def test_a_knocked_view_is_named_when_it_comes_and_the_next_ones_say_since_when(arrays, live_blade):
     clouds, poses = arrays
-    live = stitch.live(mount="eye_in_hand")
-    for cloud, pose in zip(clouds, poses, strict=True):
-        live.add_view(cloud, pose)
+    live = branch(live_blade)
     before = live.hand_eye.pose
     off = live.add_view(clouds[2] + [0.4, 0.3, 0.2], poses[2])
     assert off.verdict == "does_not_belong" and "at least" in off.why
@@ -53,11 +59,9 @@ def test_a_knocked_view_is_named_when_it_comes_and_the_next_ones_say_since_when(
     assert again.verdict == "does_not_belong" and "from v005 on" in again.why
 
 
-def test_another_part_does_not_belong(arrays):
+def test_another_part_does_not_belong(arrays, after_four):
     clouds, poses = arrays
-    live = stitch.live(mount="eye_in_hand")
-    for cloud, pose in zip(clouds[:4], poses, strict=False):
-        live.add_view(cloud, pose)
+    live = branch(after_four)
     said = live.add_view(clouds[4] + [400.0, 0.0, 0.0], poses[4])
     assert said.verdict == "does_not_belong" and "shares no surface" in said.why
 
@@ -83,12 +87,11 @@ def test_the_next_pose_lowers_U_as_it_says(live_blade):
     assert np.allclose(R @ R.T, np.eye(3)) and proposed.like in live_blade.session.names
 
 
-def test_a_copied_scan_is_said_to_be_one_and_the_next_view_is_not_accused(arrays):
+def test_a_copied_scan_is_said_to_be_one_and_the_next_view_is_not_accused(arrays, after_four):
     clouds, poses = arrays
-    for at in (1, 4):
-        live = stitch.live(mount="eye_in_hand")
-        for cloud, pose in zip(clouds[:at], poses, strict=False):
-            live.add_view(cloud, pose)
+    after_one = stitch.live(mount="eye_in_hand")
+    after_one.add_view(clouds[0], poses[0])
+    for at, live in ((1, after_one), (4, branch(after_four))):
         again = live.add_view(clouds[0], poses[0])
         assert (again.verdict, again.why) == ("adds_nothing", "Its scan is a copy of that of v000, at the same pose.")
         moved = live.add_view(clouds[0], poses[2])
@@ -101,11 +104,9 @@ def test_a_copied_scan_is_said_to_be_one_and_the_next_view_is_not_accused(arrays
 @pytest.mark.parametrize(
     "error", [KeyboardInterrupt, *(pytest.param(e, marks=pytest.mark.slow) for e in (MemoryError, ValueError))]
 )
-def test_whatever_ends_a_call_the_view_is_out(arrays, error, monkeypatch):
+def test_whatever_ends_a_call_the_view_is_out(arrays, after_four, error, monkeypatch):
     clouds, poses = arrays
-    live = stitch.live(mount="eye_in_hand")
-    for cloud, pose in zip(clouds[:4], poses, strict=False):
-        live.add_view(cloud, pose)
+    live = branch(after_four)
     before = live.hand_eye.pose
 
     def fails(*_):
@@ -142,15 +143,12 @@ def test_views_of_several_threads_are_taken_one_after_the_other(arrays):
     assert sorted(said.name for said in live.said) == live.session.names == [f"v{i:03d}" for i in range(5)]
 
 
-def test_three_points_or_none_are_no_scan_that_breaks_the_session(arrays):
-    clouds, poses = arrays
-    live = stitch.live(mount="eye_in_hand")
-    for k, cloud in enumerate([*clouds[:4], clouds[4][:3], None, clouds[4][:0], clouds[4]]):
-        try:
-            live.add_view(cloud, poses[min(k, 4)])
-        except stitch.InputError:
-            assert k in (4, 5, 6)
-    assert live.said[-1].verdict == "fits"
+def test_three_points_or_none_are_no_scan_that_breaks_the_session(arrays, after_four):
+    live, cloud, pose = branch(after_four), arrays[0][4], arrays[1][4]
+    for nothing in (cloud[:3], None, cloud[:0]):
+        with suppress(stitch.InputError):
+            live.add_view(nothing, pose)
+    assert live.add_view(cloud, pose).verdict == "fits"
 
 
 def test_inverted_poses_are_refused_when_the_first_hand_eye_is_sought(arrays):

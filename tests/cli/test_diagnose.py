@@ -48,7 +48,7 @@ def session_on_disk(tmp_path_factory, stitch_command):
     return folder
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_drawing", "few_effects")
 def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     folder = session_on_disk
     shutil.copytree(folder / "r0", folder / "r")

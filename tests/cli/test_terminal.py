@@ -92,13 +92,13 @@ QUANTITY = re.compile(
 
 
 @pytest.fixture(scope="module")
-def printed(tmp_path_factory, stitch_command):
+def printed(tmp_path_factory, stitch_command, library_of):
     """Lines that commands print of a session of labelled points, and where they are wrongly asked."""
     folder = tmp_path_factory.mktemp("lines")
     session, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]))
     measured, run = write_labelled(folder / "s", session, "points"), folder / "r"
     out = io.StringIO()
-    with redirect_stderr(out), redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
+    with redirect_stderr(out), redirect_stdout(out), pytest.MonkeyPatch.context() as patch, library_of():
         patch.setattr(Figure, "savefig", _without_pictures)
         out.write(stitch_command("check", measured))
         out.write(stitch_command("run", measured, "-o", run, "--no-recording"))

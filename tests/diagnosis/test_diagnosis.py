@@ -244,8 +244,9 @@ def test_a_range_axis_that_is_too_long_is_named_with_its_share(measured):
     assert slope == pytest.approx(0.01 * found.linear.measurement.views.standoff, rel=0.1)
 
 
-def test_a_good_scanner_is_not_accused(measured):
-    found = diagnosed(measured)
+def test_a_good_scanner_is_not_accused(measured, library_of):
+    with library_of():
+        found = diagnosed(measured)
     assert not found.follows_field and not found.overlap_misfit
 
 

@@ -13,7 +13,7 @@ from stitch.session.scanners import have_own_hand_eyes, join_sessions, scanners_
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory):
-    cell = scanner_cell("rig", 5, views=4)
+    cell = scanner_cell("rig", 5, views=4, rays=40)
     return [stitch.load_session(path) for path in write_scanners(tmp_path_factory.mktemp("cell"), cell)]
 
 
