@@ -44,12 +44,3 @@ def found(loaded):
 def better(found):
     """The run with one effect more."""
     return stitch.add(found, "range_scale")
-
-
-@pytest.fixture(scope="session")
-def live_blade(arrays):
-    """Its views, taken one by one."""
-    live = stitch.live(mount="eye_in_hand", name="s")
-    for cloud, pose in zip(*arrays, strict=True):
-        live.add_view(cloud, pose)
-    return live

@@ -89,9 +89,12 @@ def moved(view):
 
 
 @pytest.fixture(scope="module")
-def names_of_examples(arrays, cell_folder, loaded, found, better, live_blade, tmp_path_factory):
+def names_of_examples(arrays, cell_folder, loaded, found, better, tmp_path_factory):
     """What the examples call as a person would, but for the folder to write into."""
     clouds, poses = arrays
+    grown = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(clouds, poses, strict=True):
+        grown.add_view(cloud, pose)
     # What takes seconds is done once, for all examples that ask for it.
     slow = {name: cache(getattr(stitch, name)) for name in ("compare", "diagnose", "plan")}
     other = replace(loaded, name="other", views=tuple(moved(view) for view in loaded.views))
@@ -112,7 +115,7 @@ def names_of_examples(arrays, cell_folder, loaded, found, better, live_blade, tm
         "session_folder": cell_folder,
         "run": found,
         "better": better,
-        "live": live_blade,
+        "live": grown,
     }
 
 

@@ -14,6 +14,16 @@ from stitch.cli.main import main
 
 
 @pytest.fixture(scope="module")
+def live_blade(arrays):
+    """The cell's views, taken one by one."""
+    live = stitch.live(mount="eye_in_hand", name="s")
+    clouds, poses = arrays
+    for cloud, pose in zip(clouds, poses, strict=True):
+        live.add_view(cloud, pose)
+    return live
+
+
+@pytest.fixture(scope="module")
 def after_four(arrays):
     """The first four views, taken one by one: there is a hand-eye."""
     live = stitch.live(mount="eye_in_hand")

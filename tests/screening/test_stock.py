@@ -18,7 +18,7 @@ from stitch.api.pipeline import run
 from stitch.numerics import frames
 from stitch.session.capture import prepare_capture
 
-CELL = {"seed": 2, "views": 10, "pixels": 60}
+CELL = {"seed": 2, "views": 10, "pixels": 80}
 VIEW = 8
 
 
