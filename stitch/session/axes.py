@@ -14,6 +14,7 @@ where it stands.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -79,8 +80,8 @@ class Axes:
     """All axes of a session and their readings; empty without any."""
 
     axes: tuple[Axis, ...] = ()
-    readings: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) rad or length_unit
-    approach: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) −1, 0, +1: sign of the last move
+    readings: Array = field(default_factory=partial(np.zeros, (0, 0)))  # (V, K) rad or length_unit
+    approach: Array = field(default_factory=partial(np.zeros, (0, 0)))  # (V, K) −1, 0, +1: sign of the last move
     has_robot: bool = True
     length_unit: str = "mm"
 

@@ -9,7 +9,7 @@ them at once (`Views`), or of one with its points (`ScanView`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class Views:
     gravity: Array  # (3,) unit vector, base frame; (V, 3) where an axis turns what is left of the robot; zero: unknown
     eye_to_hand: bool
     names: tuple[str, ...] = ()  # of the session's views
-    T_mount: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) hand-eye, coarse
+    T_mount: Array = field(default_factory=partial(np.eye, 4))  # (4, 4) hand-eye, coarse
     axes: Axes = field(default_factory=Axes)
     scanners: Scanners = field(default_factory=Scanners)
     own_first: tuple[dict[str, float], ...] = ()  # the covariates at the first view of each scanner
@@ -210,8 +210,8 @@ class ScanView:
     cosine: Array  # (N,) of incidence, 0 … 1
     intensity: Array | None  # (N,) standardised over the session
     size: float  # of the part, length_unit: lengths of shape effects may be counted in it
-    origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
-    eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, scanner frame
+    origin: Array = field(default_factory=partial(np.zeros, 3))  # (3,) about which the part grows, reference frame
+    eye: Array = field(default_factory=partial(np.zeros, 3))  # (3,) from where the scanner looks, scanner frame
 
     def along(self, points: Array) -> Array:
         """Return unit vectors (N, 3) from the scanner's eye to points (N, 3), scanner frame."""

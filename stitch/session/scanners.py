@@ -6,6 +6,7 @@ Another stands a rigid motion right of it, `T_first`, in its own views; where it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,8 +22,8 @@ class Scanners:
     """The K scanners of V views of a joined session; empty, and false, for a session of one scanner."""
 
     names: tuple[str, ...] = ()
-    of_view: Indices = field(default_factory=lambda: np.zeros(0, np.int64))  # (V,) index of each view's scanner
-    T_first: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (K, 4, 4) T_scanner1_scanner, to begin with
+    of_view: Indices = field(default_factory=partial(np.zeros, 0, np.int64))  # (V,) index of each view's scanner
+    T_first: Array = field(default_factory=partial(np.zeros, (0, 4, 4)))  # (K, 4, 4) T_scanner1_scanner, to begin with
     standoff: tuple[float | None, ...] = ()  # length_unit; None: not stated
 
     def __bool__(self) -> bool:

@@ -3,6 +3,7 @@ arm and load that tilt its base."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ class Torques:
     # Moments about the base's axes x and y: of arm and load where masses are known, else of 1 kg at each link's frame.
     base_names: tuple[str, ...] = ()  # _x, _y; without masses _x_3 of link 3, and _x, _y of a load that is known
     base_axis: tuple[int, ...] = ()  # 0 for x, 1 for y
-    base: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, k) N·m
+    base: Array = field(default_factory=partial(np.zeros, (0, 0)))  # (V, k) N·m
 
     def only(self, keep: Sequence[int]) -> "Torques":
         """Return the torques and moments of some of the views, by index."""
