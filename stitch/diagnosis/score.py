@@ -40,20 +40,20 @@ from stitch.system.threads import parallel
 
 @dataclass(frozen=True)
 class Score:
-    """One candidate against the null."""
+    """How well one candidate explains the views, over the null model without it."""
 
     candidate: Candidate
-    observable: bool
-    form: Form  # the best one
-    p_value: float  # of the candidate, its forms counted; not yet counted over candidates
-    log_bayes_factor: float  # over everything else that may be there
-    values: Array  # (p,) of the best form, free fit
-    covariance: Array  # (p, p); NaN where no form was worth a fit
-    scale: float = 1.0  # of the plausible sizes of its parameters, the likeliest
-    variances: Array | None = None  # (c,) beside the best form; None where it was not worth a fit
-    # with the pose errors that remain beside the best form, where these have a prior
+    observable: bool  # these views could show it at a plausible size
+    form: Form  # the best of its F forms
+    p_value: float  # adjusted for its forms, not for the number of candidates
+    log_bayes_factor: float  # averaged over its forms
+    values: Array  # (p,) of the best form, fitted freely
+    covariance: Array  # (p, p) of these; NaN where no form was worth a fit
+    scale: float = 1.0  # likeliest multiple of the plausible sizes
+    variances: Array | None = None  # (c,) fitted beside the best form; None where it was not worth a fit
+    # the model in which it was scored, at these variances, where pose errors have a prior
     base_model: LinearModel | None = None
-    log_shares: Array | None = None  # (F,) nats of every form, with its share of the prior
+    log_shares: Array | None = None  # (F,) log Bayes factor of every form plus the log of its share of the prior
 
     @property
     def name(self) -> str:
@@ -78,14 +78,14 @@ class Score:
 
 @dataclass(frozen=True)
 class FormTrial:
-    """One form against the null."""
+    """How well one form explains the views; without a fit, only a bound of its log Bayes factor."""
 
     log_bayes_factor: float
     p_value: float = 1.0
-    values: Array | None = None  # (p,) free fit; None where the form was not worth one
-    covariance: Array | None = None
-    variances: Array | None = None  # (c,)
-    scale: float = 1.0  # of the plausible sizes, the likeliest
+    values: Array | None = None  # (p,) fitted freely; None where the form was not worth a fit
+    covariance: Array | None = None  # (p, p)
+    variances: Array | None = None  # (c,) fitted beside it
+    scale: float = 1.0  # likeliest multiple of the plausible sizes
 
 
 def score(linear: LinearModel, candidate: Candidate, start: Array | None = None) -> Score:
@@ -98,54 +98,63 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
         start: (c,) variances at which the fits begin; None: the best of several starts, as there may be local maxima.
     """
     base = linear.without([candidate.name])
-    regime = regime_of(base)
     starts = (base, *base.alternative_starts)
     at_starts = [_gains_at_null(base, at, candidate) for at in starts]
-    quick = np.array([[gain for gain, _ in gains] for gains, _ in at_starts]).T
-    observable = any(shown for _, shown in at_starts)
-    likely = quick.max(axis=1)
-    best_start = quick.argmax(axis=1)
+    quick_gains = np.array([[gain for gain, _ in of_forms] for of_forms, _ in at_starts])
+    gains = quick_gains.max(axis=0)
+    best_start = quick_gains.argmax(axis=0)
     # Where the scatter has absorbed a gross effect, no plausible size seems observable; yet the effect gains.
-    observable = observable or bool(likely.max() > limits.LOG_BAYES_FACTOR)
-    least = max(regime.least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
+    observable = any(seen for _, seen in at_starts) or bool(gains.max() > limits.LOG_BAYES_FACTOR)
     weights = form_weights(candidate)
-    # A candidate that cannot gain is fitted in one form only, to report its size.
-    hopeless = regime.prior and logsumexp(likely + np.log(weights)) < -limits.REFIT_GAIN_WITH_PRIOR
-    shown = [i for i in np.argsort(-likely, kind="stable") if candidate.forms[i].columns.any()]
-    likeliest = shown[: 1 if hopeless else regime_of(linear).forms_refitted]
-    trials = [FormTrial(float(gain)) for gain in likely]
-    for i in sorted(likeliest):
-        form = candidate.forms[i]
-        if likely[i] >= least:
-            variances = starts[best_start[i]].null.variances if start is None else start
-            trials[i] = try_form(base, form, variances, at_starts[best_start[i]][0][i][1])
+    trials = [FormTrial(float(gain)) for gain in gains]
+    for i in _forms_to_fit(base, candidate, gains, regime_of(linear).forms_refitted):
+        _, scale = at_starts[best_start[i]][0][i]
+        variances = starts[best_start[i]].null.variances if start is None else start
+        trials[i] = try_form(base, candidate.forms[i], variances, scale)
     k = max(range(len(trials)), key=lambda i: (trials[i].values is not None, trials[i].log_bayes_factor))
     best = trials[k]
     form = candidate.forms[k]
     log_shares = np.array([trial.log_bayes_factor for trial in trials]) + np.log(weights)
-    gained = float(logsumexp(log_shares))
+    log_bayes_factor = float(logsumexp(log_shares))
     p_value = float(min(1.0, np.min(np.array([trial.p_value for trial in trials]) / weights)))
     values = np.zeros(len(form.sizes))
     covariance = np.diag(values + np.nan)
     if best.values is not None and best.covariance is not None:
         values, covariance = best.values, best.covariance
-        p_value, gained = (p_value, gained) if observable else (1.0, 0.0)
-    beside = None
-    if regime.prior and best.variances is not None:
-        beside = replace(base, null=at_variances(base.mixed, best.variances))
+        if not observable:
+            p_value, log_bayes_factor = 1.0, 0.0
+    base_model = None
+    if regime_of(base).prior and best.variances is not None:
+        base_model = replace(base, null=at_variances(base.mixed, best.variances))
     return Score(
         candidate,
         observable,
         form,
         p_value,
-        gained,
+        log_bayes_factor,
         values=values,
         covariance=covariance,
         scale=best.scale,
         variances=best.variances,
-        base_model=beside,
+        base_model=base_model,
         log_shares=log_shares,
     )
+
+
+def _forms_to_fit(base: LinearModel, candidate: Candidate, gains: Array, most: int) -> list[int]:
+    """Return the indices of the forms that are worth a fit with all variances, `most` of them at the most.
+
+    They are the likeliest ones that the views show at all, and that may still gain. A candidate that cannot gain is
+    fitted in one form only, to report its size.
+
+    Args:
+        gains: (F,) log Bayes factors at fixed variances.
+    """
+    regime = regime_of(base)
+    is_hopeless = regime.prior and logsumexp(gains + np.log(form_weights(candidate))) < -limits.REFIT_GAIN_WITH_PRIOR
+    visible = [i for i in np.argsort(-gains, kind="stable").tolist() if candidate.forms[i].columns.any()]
+    least = max(regime.least_quick_gain, gains.max() - limits.NEGLIGIBLE_NATS)
+    return [i for i in sorted(visible[: 1 if is_hopeless else most]) if gains[i] >= least]
 
 
 def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> FormTrial:
@@ -179,21 +188,21 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     else:
         free = fit_variances(mixed, G, wide, integrated.variances)
     a = mixed.A.shape[2]
-    theta, of_theta = free.mean[a:], free.covariance[a:, a:]
+    theta, covariance = free.mean[a:], free.covariance[a:, a:]
     # θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does.
-    values, vectors = np.linalg.eigh(of_theta / np.outer(form.sizes, form.sizes))
+    values, vectors = np.linalg.eigh(covariance / np.outer(form.sizes, form.sizes))
     seen = values < 0.5 * limits.FREE_SIZES**2
     square = float(np.sum((vectors[:, seen].T @ (theta / form.sizes)) ** 2 / np.maximum(values[seen], 1e-300)))
     rank = int(seen.sum())
     # The scatter along the columns of a form is known to fewer degrees of freedom than numbers are left, where views
     # tell several components apart; among very many numbers to as many.
-    known: float = max(mixed.size - a - rank, 1)
+    degrees_of_freedom: float = max(mixed.size - a - rank, 1)
     if not regime.one_scale_is_enough:
         white = linear.in_blocks(linear.residual(form.columns))
-        known = max(linear.satterthwaite.degrees_of_freedom(white), 1.0)
-    p_value = f_tail(square / max(rank, 1), max(rank, 1), known)
-    gained = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(deviances.values())), scales)
-    return FormTrial(gained, p_value, theta, of_theta, integrated.variances, scale)
+        degrees_of_freedom = max(linear.satterthwaite.degrees_of_freedom(white), 1.0)
+    p_value = f_tail(square / max(rank, 1), max(rank, 1), degrees_of_freedom)
+    log_bayes_factor = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(deviances.values())), scales)
+    return FormTrial(log_bayes_factor, p_value, theta, covariance, integrated.variances, scale)
 
 
 def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[tuple[Candidate, float]]:
@@ -354,24 +363,26 @@ def beyond_expected(linear: LinearModel, expected: ScatterLimit) -> bool:
     """
     mixed = linear.mixed
     noise = np.diagonal(mixed.components[NOISE], axis1=1, axis2=2)
-    unit = 1 / np.sqrt(np.maximum(noise, 1e-300))
+    per_noise = 1 / np.sqrt(np.maximum(noise, 1e-300))
     variances = np.array([expected.rotation**2, expected.translation**2, USUAL_NOISE_FACTOR])
-    covariance = np.einsum("c,cbij->bij", variances, mixed.components[: NOISE + 1])
-    covariance = covariance * unit[:, :, None] * unit[:, None]
-    white = (mixed.A * unit[:, :, None]).reshape(-1, mixed.A.shape[2])
-    mean = column_space(white).reshape((*mixed.A.shape[:2], -1))
-    left = (mixed.z * unit).ravel()
-    flat = mean.reshape(len(left), -1)
-    left = left - flat @ (flat.T @ left)
-    # tr(MC) and tr(MCMC) with M = 1 − UUᵀ.
-    along = covariance @ mean
-    within = np.einsum("bik,bil->kl", mean, along)
-    count, square = mixed.noise_only
-    total = float(np.trace(covariance, axis1=1, axis2=2).sum() - np.trace(within)) + count * USUAL_NOISE_FACTOR
-    squares = float((covariance**2).sum() - 2 * (along**2).sum() + (within**2).sum()) + count * USUAL_NOISE_FACTOR**2
-    known = max(total**2 / max(squares, 1e-300), 1e-9)
+    C = np.einsum("c,cbij->bij", variances, mixed.components[: NOISE + 1])
+    C = C * per_noise[:, :, None] * per_noise[:, None]
+    design = (mixed.A * per_noise[:, :, None]).reshape(-1, mixed.A.shape[2])
+    # U by blocks, as C, and the same as one matrix.
+    U = column_space(design).reshape((*mixed.A.shape[:2], -1))
+    z = (mixed.z * per_noise).ravel()
+    flat_U = U.reshape(len(z), -1)
+    residual = z - flat_U @ (flat_U.T @ z)
+    CU = C @ U
+    UCU = np.einsum("bik,bil->kl", U, CU)
+    # Numbers that hold noise alone are kept apart, with their count and their sum of squares.
+    count, noise_square = mixed.noise_only
+    trace_MC = float(np.trace(C, axis1=1, axis2=2).sum() - np.trace(UCU)) + count * USUAL_NOISE_FACTOR
+    trace_MCMC = float((C**2).sum() - 2 * (CU**2).sum() + (UCU**2).sum()) + count * USUAL_NOISE_FACTOR**2
+    degrees_of_freedom = max(trace_MC**2 / max(trace_MCMC, 1e-300), 1e-9)
     chance = limits.ALPHA_UNKNOWN / 2 if expected.stated else limits.ALPHA
-    return float(left @ left) + square > total * chi2_limit(chance, known) / known
+    limit = trace_MC * chi2_limit(chance, degrees_of_freedom) / degrees_of_freedom
+    return float(residual @ residual) + noise_square > limit
 
 
 def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:

@@ -81,8 +81,8 @@ def imitated_share(y: Array, X: Array) -> float:
     # Ridge at ten plausible sizes: what is invisible cannot be blown up to imitate anything.
     M = X.T @ X + 0.01 * np.eye(X.shape[1])
     fitted = X @ np.linalg.solve(M, X.T @ y)
-    alike = float(np.linalg.norm(fitted))
-    return float(np.clip(fitted / alike @ (y / length), 0.0, 1.0)) if alike > 0 else 0.0
+    fitted_length = float(np.linalg.norm(fitted))
+    return float(np.clip(fitted / fitted_length @ (y / length), 0.0, 1.0)) if fitted_length > 0 else 0.0
 
 
 def hand_eye_response(linear: LinearModel) -> Array:
@@ -149,6 +149,7 @@ def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: di
 
 
 def _spread(count: int, most: int) -> Indices:
+    """Return at most so many indices, evenly spread over 0 … count − 1."""
     return np.unique(np.linspace(0, count - 1, most).astype(int))
 
 
@@ -185,15 +186,15 @@ def least_noncentrality(
     if needed > limits.UNDETECTABLE_SQUARE:
         return float("inf")
 
-    def missed(shift: float) -> float:
-        """Return the power at noncentrality `shift` less the one that is needed; negative where it is too little."""
-        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - limits.POWER
+    def excess_power(noncentrality: float) -> float:
+        """Return the power of the test less the one that is asked for."""
+        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, noncentrality) - limits.POWER
 
-    # From below: the series of the distribution fails for shifts far beyond what is needed.
+    # From below: the series of the distribution fails far beyond what is needed.
     enough = needed + 10.0
-    while missed(enough) < 0:
+    while excess_power(enough) < 0:
         enough *= 1.5
-    return float(brentq(missed, 1e-9, enough))
+    return float(brentq(excess_power, 1e-9, enough))
 
 
 def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -> float:

@@ -97,23 +97,25 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     All is linear. The errors of points are those of a fit in which poses scatter independently, as in `add`. Those of
     poses, which decide whether the effect helps, have all other pose errors as random effects.
     """
-    fitted = linear.restricted(())
-    beside = scored.base_model or linear
-    trial, squares, scatter = _squares_by_fold(beside, scored)
-    whole, alone = trial, scatter
-    if beside is not fitted:
-        whole, squares, alone = _squares_by_fold(fitted, score(fitted, scored.candidate))
-    heldout, heldout_sigma = mean_square_share(*squares)
-    poses, poses_sigma = mean_square_share(*scatter)
-    present = fitted.baseline_trial
+    independent = linear.restricted(())
+    base = scored.base_model or linear
+    trial, point_squares, pose_squares = _squares_by_fold(base, scored)
+    independent_trial, independent_pose_squares = trial, pose_squares
+    if base is not independent:
+        again = score(independent, scored.candidate)
+        independent_trial, point_squares, independent_pose_squares = _squares_by_fold(independent, again)
+    heldout, heldout_sigma = mean_square_share(*point_squares)
+    poses, poses_sigma = mean_square_share(*pose_squares)
+    present = independent.baseline_trial
+    square = independent_trial.squares(independent_trial.solve()).sum()
     return CrossValidation(
-        inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
+        inside=float(square / present.squares(present.solve()).sum()),
         heldout=heldout,
         poses=poses,
         poses_sigma=poses_sigma,
-        steadiness=_steadiness(beside, trial, scored.form.response),
+        steadiness=_steadiness(base, trial, scored.form.response),
         heldout_sigma=heldout_sigma,
-        fold_squares=tuple(tuple(map(float, folds[0])) for folds in (squares, alone)),
+        fold_squares=tuple(tuple(map(float, folds[0])) for folds in (point_squares, independent_pose_squares)),
     )
 
 
@@ -244,27 +246,34 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:
         return None
-    a = linear.design.shape[1]
     trial = linear.trial(np.hstack([linear.design, scored.form.response]))
-    # A prior of the parameters' plausible sizes with the tails of Student's t: what the other views hardly see would
-    # otherwise be anything, and the end would judge that instead of the effect. The normal prior that stands for t with
-    # ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1) (Lange, Little & Taylor 1989, J. Am.
-    # Stat. Assoc. 84:881).
-    sizes = np.append(linear.sizes, scored.sizes)
-    mean = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
-    free = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, mean)
-    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0][-len(mean) :] - mean, 0.0)
-    freedom = limits.END_PRIOR_FREEDOM
-    precision = (freedom + 1) / (freedom * sizes**2 + estimate**2)
-    priors = CoefficientPrior(precision, mean), CoefficientPrior(precision[:a], mean[:a])
+    priors = _end_priors(linear, scored, trial)
     squares = [[trial.squares(x, end.views) for x in trial.solve_each(priors, end.views)] for end in ends]
-    shares = [mean_square_share(with_it, without) for with_it, without in squares]
+    shares = [mean_square_share(with_effect, without) for with_effect, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
-    total = mean_square_share(*np.array([[end.sum() for end in row] for row in squares]).T)
+    total = mean_square_share(*np.array([[of_end.sum() for of_end in row] for row in squares]).T)
+    # The ends are samples of log shares: a further one is better with the probability that its log is below zero.
     logs = np.log([max(share, 1e-300) for share, _ in shares])
     spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
     likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
     return Extrapolation(*total, ends[worst], *shares[worst], likely)
+
+
+def _end_priors(linear: LinearModel, scored: Score, trial: LinearTrial) -> tuple[CoefficientPrior, CoefficientPrior]:
+    """Return the priors of a fit with a candidate, and of one without, that predict an end of a joint's range.
+
+    Plausible sizes s with the tails of Student's t: what the other views hardly see would otherwise be anything, and
+    the end would judge that instead of the effect. The normal prior that stands for t with ν degrees of freedom at an
+    estimate θ has the variance (ν·s² + θ²)/(ν + 1) (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
+    """
+    a = linear.design.shape[1]
+    sizes = np.append(linear.sizes, scored.sizes)
+    mean = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
+    wide = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, mean)
+    estimate = np.where(np.isfinite(sizes), trial.solve_each([wide])[0][-len(mean) :] - mean, 0.0)
+    freedom = limits.END_PRIOR_FREEDOM
+    precision = (freedom + 1) / (freedom * sizes**2 + estimate**2)
+    return CoefficientPrior(precision, mean), CoefficientPrior(precision[:a], mean[:a])
 
 
 @dataclass(frozen=True)

@@ -566,20 +566,21 @@ def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]
     Parameters that are tried value by value (`grid`) belong to no joint's group. Of an effect of joints, an argument
     that is no array over joints makes a group by itself.
     """
+    groups: dict[str, list[int]] = {}
     if effect.place == "axis":
-        of_axes: dict[str, list[int]] = {}
-        for i, parameter in enumerate(parameters):
-            of_axes.setdefault(parameter.name.partition("_")[2], []).append(i)
-        return list(of_axes.values())
+        for i, p in enumerate(parameters):
+            axis = p.name.partition("_")[2]
+            groups.setdefault(axis, []).append(i)
+        return list(groups.values())
     if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
         return []
-    joints: dict[str, list[int]] = {}
     for i, p in enumerate(parameters):
         if not p.grid:
+            # Names are c2 of joint 2, or c2_3 of joint 2 and link 3.
             per_joint = effect.specs[p.argument].kind in ("joint", "torque")
-            whose = p.name[len(p.argument) :].split("_")[0] if per_joint else p.argument
-            joints.setdefault(whose, []).append(i)
-    return list(joints.values())
+            key = p.name[len(p.argument) :].split("_")[0] if per_joint else p.argument
+            groups.setdefault(key, []).append(i)
+    return list(groups.values())
 
 
 def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:

@@ -106,7 +106,9 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     def fuse_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
         """Return the fused cloud of one slab, None where it is empty, and how many of its points support nothing."""
         voxels, unsupported = zip(*(view.voxels(number) for view in views), strict=True)
-        together = _Voxels(*(np.concatenate(columns) for columns in zip(*map(_columns, voxels), strict=True)))
+        together = _Voxels(
+            *(np.concatenate(columns) for columns in zip(*(vars(x).values() for x in voxels), strict=True))
+        )
         del voxels
         cloud = _moved(_fuse_voxels(together), T_part) if len(together.cell) else None
         return cloud, sum(unsupported, Unsupported())
@@ -147,7 +149,7 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None, T_part: Arra
 def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
     """Return all points of all scans in the reference frame, one view after the other."""
     placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
-    return PlacedPoints(*(np.concatenate(columns) for columns in zip(*map(_columns, placed), strict=True)))
+    return PlacedPoints(*(np.concatenate(columns) for columns in zip(*(vars(p).values() for p in placed), strict=True)))
 
 
 def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
@@ -180,6 +182,7 @@ def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
 
 
 def _moved(cloud: FusedCloud, T: Array) -> FusedCloud:
+    """Return a fused cloud with its points and normals moved by T (4, 4)."""
     return replace(cloud, points=frames.transform(T, cloud.points), normals=frames.rotate(T, cloud.normals))
 
 
@@ -196,10 +199,6 @@ class _Voxels:
     weight: Array  # (G,)
     points: Array  # (G, 3) weighted mean
     normals: Array  # (G, 3) weighted mean, shorter than 1
-
-
-def _columns(rows: _Voxels | PlacedPoints) -> tuple[Array, ...]:
-    return tuple(vars(rows).values())
 
 
 def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:

@@ -242,28 +242,30 @@ def pose_covariance(
     equations = normal_equations(overlaps, capture, poses, poses, scatter=scatter, method=method)
     inverse = symmetric_inverse(equations.H - block_diag(*prior) + K)
     weights = method.weigh(overlaps.matches, capture, poses)
-    # Free offsets of views are unknowns too. They are eliminated: `taken` says how much of their gradient the twists
-    # get.
+    # Free offsets of views are unknowns too. They are eliminated: by `from_offsets` their gradient enters the twists'.
     free = [v for v, scan in enumerate(capture.scans) if method.offsets and (scan.stock or v in equations.offsets)]
     sums = OffsetSums(g, overlaps.matches, weights, capture)
-    taken = np.linalg.solve(sums.matrix[np.ix_(free, free)], sums.coupling.reshape(size, -1)[:, free].T)
-    pulls = [csr_array((len(scan.points), size + len(free))) for scan in capture.scans]
+    from_offsets = np.linalg.solve(sums.matrix[np.ix_(free, free)], sums.coupling.reshape(size, -1)[:, free].T)
+    # Per view, the gradient by each of its points: by the twists of all views, then by the free offsets.
+    gradients = [csr_array((len(scan.points), size + len(free))) for scan in capture.scans]
     for m, weight in zip(overlaps.matches, weights, strict=True):
         rows = frames.plane_rows(m.middle - g.centre, m.normal)
-        pulled = np.zeros((len(rows), size + len(free)))
+        by_distance = np.zeros((len(rows), size + len(free)))
         sides = ((m.v, m.index_v, 1.0), (m.w, m.index_w, -1.0))
         for v, index, sign in sides:
-            pulled[:, 6 * v : 6 * v + 6] = sign * rows
+            by_distance[:, 6 * v : 6 * v + 6] = sign * rows
             if v in free:
-                pulled[:, size + free.index(v)] = sign * acts(capture, v, index)
+                by_distance[:, size + free.index(v)] = sign * acts(capture, v, index)
         for v, index, sign in sides:
             at = index, np.arange(len(index))
-            of_points = csr_array((sign * weight / variance, at), (len(capture.scans[v].points), len(index)))
-            pulls[v] = pulls[v] + of_points @ csr_array(pulled)
-    known = [scan.noise if np.isfinite(scan.noise) else np.sqrt(g.variance / 2) for scan in capture.scans]
-    meat = sum(noise**2 * (pulled.T @ pulled).toarray() for noise, pulled in zip(known, pulls, strict=True))
-    left = np.hstack([np.eye(size), -taken.T])
-    return inverse @ (left @ meat @ left.T + K) @ inverse
+            to_points = csr_array((sign * weight / variance, at), (len(capture.scans[v].points), len(index)))
+            gradients[v] = gradients[v] + to_points @ csr_array(by_distance)
+    noises = [scan.noise if np.isfinite(scan.noise) else np.sqrt(g.variance / 2) for scan in capture.scans]
+    scatter_of_gradient = sum(
+        noise**2 * (gradient.T @ gradient).toarray() for noise, gradient in zip(noises, gradients, strict=True)
+    )
+    elimination = np.hstack([np.eye(size), -from_offsets.T])
+    return inverse @ (elimination @ scatter_of_gradient @ elimination.T + K) @ inverse
 
 
 class _Progress:

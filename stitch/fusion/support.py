@@ -21,7 +21,8 @@ from stitch.system.threads import parallel
 _NONE = 1e100
 # Bits for a coordinate of a cell: three of them are one integer.
 _BITS = 21
-# Neighbours that are asked, and how many have to lie on one surface; a neighbour on an edge counts half.
+# Neighbours of a point that are looked up, the votes of those that have to lie on one surface, and the vote of a
+# neighbour on an edge; that of any other is 1.
 _NEIGHBOURS, _LEAST, _EDGE_VOTE = 8, 3.0, 0.5
 # Normals of one surface, as cosines to their mean.
 _ALIKE = 0.6
@@ -98,8 +99,10 @@ def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell
     settled, scatter = _points_on_surface(placed, cell)
     parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
     # A view full of stray points overestimates its own noise and spacing: both are limited by the other views'.
-    noise = _limited([scan.noise for scan in scans])
-    angles = _limited([scan.solid_angle for scan in scans])
+    noise, angles = (
+        np.minimum(values, _OF_OTHERS * float(np.median(values)))
+        for values in ([scan.noise for scan in scans], [scan.solid_angle for scan in scans])
+    )
     tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, noise, angles, strict=True)))
     held = np.concatenate([test[0] for test in tests])
     junk = np.array([test[1] for test in tests])
@@ -128,7 +131,7 @@ def weighted_sums(group: Indices, weight: Array, values: Array) -> Array:
 
 
 def edge_credit(junk: float) -> float:
-    """How far an edge is believed where such a share of a view stands alone: the decimal logarithm of the odds."""
+    """Return how far an edge is believed in a view of which a share is junk: log10 of 0.1 / share, at least 0.1."""
     return float(max(np.log10(_JUNK / max(junk, 1e-9)), _LEAST_CREDIT))
 
 
@@ -166,11 +169,6 @@ def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     shows = np.bincount(group, placed.usable & near & alike, len(groups)) > 0
     others = np.bincount(groups // views, shows, len(weight))[at] - shows[group]
     return near & (others >= np.where(placed.usable, 1, 2)), scatter
-
-
-def _limited(values: Sequence[float]) -> Array:
-    """(V,) values of one scanner's views, none beyond twice their median."""
-    return np.minimum(values, _OF_OTHERS * float(np.median(values)))
 
 
 def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float) -> tuple[Mask, float]:

@@ -148,24 +148,24 @@ def find_wrong_joint(
     if robot is None or joints is None or m.T is None or session.axes:
         return None
     points = capture.scans[m.view].points[::_EVERY]
-    there = frames.transform(m.T, points)
+    on_surface = frames.transform(m.T, points)
 
-    def off(q: Array) -> float:
+    def distance_at(q: Array) -> float:
         """Return the rms distance (length_unit) of the scan's points at joints q (n,), rad, from where they fit."""
         T = forward(robot, q)
         T = frames.inverse(T) if session.mount == "eye_to_hand" else T
-        return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
+        return float(np.sqrt(((frames.transform(T @ T_mount, points) - on_surface) ** 2).sum(axis=1).mean()))
 
     best: tuple[float, int, float] = (np.inf, 0, 0.0)
     for j in range(len(joints)):
         unit = np.eye(len(joints))[j]
         grid = np.linspace(-np.pi, np.pi, 181)
-        near = grid[int(np.argmin([off(joints + turn * unit) for turn in grid]))]
-        for start in (near, 0.0):
-            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(start - 0.02, start + 0.02))
+        nearest = grid[int(np.argmin([distance_at(joints + turn * unit) for turn in grid]))]
+        for start in (nearest, 0.0):
+            fit = minimize_scalar(lambda x, u=unit: distance_at(joints + x * u), bracket=(start - 0.02, start + 0.02))
             best = min(best, (float(fit.fun), j, float(fit.x)))
-    left, j, turn = best
-    if left > _MAX_REMAINING_SHARE * off(joints):
+    remaining, j, turn = best
+    if remaining > _MAX_REMAINING_SHARE * distance_at(joints):
         return None
     others = [session.views[row].joints for row in (m.view - 1, m.view + 1) if 0 <= row < len(session.views)]
     is_neighbours = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)

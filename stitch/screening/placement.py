@@ -253,7 +253,7 @@ def place_unlinked_views(
 
     The core is the largest group of linked views. Other groups are placed first, each as a whole, then single views;
     each one placed joins the core, and the others are tried again. On a part that looks alike from several sides a view
-    may fit several places: it is not placed unless one of them is its row's pose.
+    may fit several places: it is not placed unless one of them is the pose of its own row in the table.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.

@@ -180,14 +180,14 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
     # One state per number of freed views, from none on: fit, columns of the mean, projector.
     states = list[tuple[VarianceFit, Array | None, Projector]]()
     columns = _free_view_columns(model, excluded, steps)
-    most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
+    most_freed = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
     significant = 0
     while True:
         fit = model.fit(columns)
         under = projector(model, fit, columns)
         states.append((fit, columns, under))
         rest = [v for v in range(model.count) if v not in excluded and v not in freed]
-        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
+        if len(freed) >= min(most_freed, significant + _MASKING_DEPTH) or under.degrees < FEWEST_DEGREES:
             break
         tests = dict(zip(rest, test_alternatives(under, [model.views[v] for v in rest]), strict=True))
         likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
@@ -222,7 +222,7 @@ def _find_unlinked_blunders(
 
 
 def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
-    """Return columns (n, K) of views that stay free, and of steps; None without any."""
+    """Return the columns (n, K) by which excluded views, and the views behind steps, move freely; None without any."""
     if not len(excluded) and not steps:
         return None
     return hstack_columns(model.columns(excluded), *(step.columns(model) for step in steps))
@@ -314,31 +314,32 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
     under = projector(model, model.fit(columns), columns)
     mean = model.mixed(columns).A[0]
 
-    def says_more(displaced: Array) -> bool:
+    def is_new(displaced: Array) -> bool:
         """Return whether columns (n, 6) are not contained in the orthonormal columns of the mean."""
-        rest = displaced - mean @ (mean.T @ displaced)
-        return bool(np.linalg.norm(rest) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
+        outside = displaced - mean @ (mean.T @ displaced)
+        return bool(np.linalg.norm(outside) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
 
-    saying = [v for v, response in enumerate(model.views) if says_more(response)]
-    alone = dict(zip(saying, test_alternatives(under, [model.views[v] for v in saying]), strict=True))
-    if not alone:
+    views = [v for v, response in enumerate(model.views) if is_new(response)]
+    view_tests = dict(zip(views, test_alternatives(under, [model.views[v] for v in views]), strict=True))
+    if not view_tests:
         return None
-    every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
-    starts = [k for k in every if k not in [k for starts in taken for k in starts.values()]]
+    possible_starts = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
+    taken_starts = {k for starts in taken for k in starts.values()}
+    starts = [k for k in possible_starts if k not in taken_starts]
     steps = {(moved, k): model.steps[moved][k] for moved in MOVED_BODIES for k in starts}
-    more = {at: displaced for at, displaced in steps.items() if says_more(displaced)}
-    tests = dict(zip(more, test_alternatives(under, list(more.values())), strict=True))
-    view = min(alone, key=lambda v: alone[v].rank)
-    likelier = min(tests, key=lambda at: tests[at].rank, default=None)
-    # `likelier` is None where every start of a step is taken already, as with few views.
-    if likelier is None or alone[view].rank < tests[likelier].rank:
-        return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
+    new_steps = {step: displaced for step, displaced in steps.items() if is_new(displaced)}
+    step_tests = dict(zip(new_steps, test_alternatives(under, list(new_steps.values())), strict=True))
+    view = min(view_tests, key=lambda v: view_tests[v].rank)
+    step = min(step_tests, key=lambda at: step_tests[at].rank, default=None)
+    # There is no step where every start is taken already, as with few views.
+    if step is None or view_tests[view].rank < step_tests[step].rank:
+        return _Pick(model.views[view], view_tests[view].p_value * model.count, model.count)
     best = dict[MovedBody, int]()
     for moved in MOVED_BODIES:
-        statistics = {k: tests[moved, k].statistic for k in starts if (moved, k) in tests}
-        best[moved] = max(statistics, key=statistics.__getitem__, default=likelier[1])
-    count = len(MOVED_BODIES) * len(every) * _MAX_STEPS
-    return _Pick(steps[likelier], tests[likelier].p_value * count, count, best)
+        statistics = {k: step_tests[moved, k].statistic for k in starts if (moved, k) in step_tests}
+        best[moved] = max(statistics, key=statistics.__getitem__, default=step[1])
+    count = len(MOVED_BODIES) * len(possible_starts) * _MAX_STEPS
+    return _Pick(steps[step], step_tests[step].p_value * count, count, best)
 
 
 def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
@@ -370,15 +371,17 @@ def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody
 def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
     """Return Akaike's criterion for few observations (Hurvich and Tsai 1989), inf where parameters use them up.
 
-    −2 log likelihood + 2kn/(n − k − 1), of n numbers and k free parameters. The plain criterion would prefer to free
-    half of the views, which leaves no scatter.
+    −2 log likelihood + 2kn/(n − k − 1), of n numbers and k free parameters. The criterion for many observations would
+    prefer half of the views as free blunders, since then no scatter is left.
 
     Args:
         columns: (n, K) in the mean beside the hand-eye; None: none.
     """
     count = len(model.z)
     fitted = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
-    return model.deviance(columns) + 2 * fitted * count / (count - fitted - 1) if count > fitted + 1 else np.inf
+    if count <= fitted + 1:
+        return np.inf
+    return model.deviance(columns) + 2 * fitted * count / (count - fitted - 1)
 
 
 def expected_poses(

@@ -163,10 +163,11 @@ def snoop_views(
     torn = {v for v in located.torn if v not in located.unplaced}
     misplaced_views = {m.view for m in standing_out}
     if misplaced_views and usual is not None:
-        # Those that stand out beside what usually happens to all of them too.
+        # Only those are misplaced that stand out even beside usual effects of the arm; the others are suspected.
         with_usual = model.with_usual(usual.twists(located.unconstrained))
-        again = find_blunders(with_usual, tests.excluded, tests.steps)
-        misplaced_views &= set(again.blunders) | tests.beyond_effects | torn
+        beside_usual = find_blunders(with_usual, tests.excluded, tests.steps)
+        misplaced_views &= set(beside_usual.blunders) | tests.beyond_effects | torn
+    # Views whose overlaps hold no other view in its place.
     holding_nothing = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
     groups = linkage(located.unconstrained.overlaps, holding_nothing).components
     foreign = [

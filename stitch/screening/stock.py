@@ -99,7 +99,7 @@ def find_stock(
     if capture.none_has_stock or few or scatters_beyond_effects(session, snooping):
         return {}
     taken = [v for v, scan in enumerate(capture.scans) if scan.stock is not None]
-    for view in _asked(capture, T_mount, unconstrained, scatter):
+    for view in _views_that_may_have_stock(capture, T_mount, unconstrained, scatter):
         rest = [v for v in off if v != view]
         stock = stock_of(capture, T_mount, unconstrained.overlaps.gate, view, rest, usual_twist(session.length_unit))
         if stock is not None and abs(stock.thickness) > _between_scanners(capture, view):
@@ -158,7 +158,9 @@ def locate_stock(
     return located
 
 
-def _asked(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability) -> list[int]:
+def _views_that_may_have_stock(
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, scatter: Repeatability
+) -> list[int]:
     """Return the views that may have stock, the likeliest first, `_MOST_ASKED` at most.
 
     A view may if its residuals keep a shape, more than in other views, or if an offset of its whole surface is
@@ -168,8 +170,8 @@ def _asked(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, 
     offset = _whole_offsets(capture, T_mount, unconstrained, scatter)
     least = max(_SHAPE, _TIMES_USUAL * float(np.median(shape)))
     likely = {v: max(shape[v] / least, offset[v] / _OFFSET) for v in range(len(shape))}
-    asked = [v for v in likely if likely[v] > 1 and capture.scans[v].stock is None]
-    return sorted(asked, key=lambda v: -likely[v])[:_MOST_ASKED]
+    possible = [v for v in likely if likely[v] > 1 and capture.scans[v].stock is None]
+    return sorted(possible, key=lambda v: -likely[v])[:_MOST_ASKED]
 
 
 def _shape_left(capture: Capture, unconstrained: UnconstrainedPoses) -> Array:
@@ -341,14 +343,14 @@ def _hold_against_others(
 
 @dataclass(frozen=True)
 class _Fit:
-    """What one explanation leaves of a view's distances."""
+    """One explanation of a view's distances, fitted: stock, a wrong pose, or neither."""
 
-    thickness: float
-    sigma: float
+    thickness: float  # of the stock, length_unit
+    sigma: float  # of the thickness
     points: Mask  # (N,) of the view, that have stock
-    share: float
+    share: float  # of the view's surface that has stock
     evidence: float  # log likelihood of distances and poses
-    over_torn: float  # of a region: by how much it is likelier than a motion of the region; infinite for none
+    over_torn: float  # nats by which stock on its region is likelier than a motion of the region; inf without one
 
 
 def _fit(case: _Case, kind: str) -> _Fit | None:
@@ -365,10 +367,10 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
     thickness, scale = 0.0, np.inf
     points = np.zeros(len(scan.points), bool)
     for _ in range(_STEPS):
-        found = case.distances(x, thickness * points)
-        if found is None:
+        distances = case.distances(x, thickness * points)
+        if distances is None:
             return None
-        e, weight, index, cosine, by_twists = found
+        e, weight, index, cosine, by_twists = distances
         e = e + thickness * cosine * points[index]
         member, edge = np.zeros((2, len(e)), bool)
         if kind == "stock":
@@ -376,37 +378,41 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
         if member.any():
             points = member[KDTree(scan.points[index]).query(scan.points)[1]]
         rows = np.column_stack([by_twists, -cosine * member])
-        left = e + thickness * rows[:, -1]
-        scale = max(case.sigma, min(scale, mad_sigma(left)))
-        w = weight * tukey(left, scale) * ~edge / (case.sigma**2 * case.factor)
+        residual = e + thickness * rows[:, -1]
+        scale = max(case.sigma, min(scale, mad_sigma(residual)))
+        w = weight * tukey(residual, scale) * ~edge / (case.sigma**2 * case.factor)
         H = (rows.T * w) @ rows
         H[:-1, :-1] += case.H + K
-        pulls = rows * (w * left)[:, None]
-        gradient = pulls.sum(axis=0)
+        gradients = rows * (w * residual)[:, None]
+        gradient = gradients.sum(axis=0)
         gradient[:-1] += case.b + case.H @ x + K @ (case.twists + x)
         change = -symmetric_inverse(H) @ gradient
         x = x + change[:-1]
         thickness += float(change[-1])
-        far = max(np.abs(change[:-1].reshape(-1, 6)[:, 3:]).max(), abs(change[-1]))
-        if scale == case.sigma and far < _CONVERGED * case.sigma:
+        largest_change = max(np.abs(change[:-1].reshape(-1, 6)[:, 3:]).max(), abs(change[-1]))
+        if scale == case.sigma and largest_change < _CONVERGED * case.sigma:
             break
-        if far < _NEAR * scale:
+        if largest_change < _NEAR * scale:
             scale /= 2
     inside = member & ~edge
     if kind == "stock" and not w[inside].any():
         # No region is left, or robust weights reject all of it.
         return None
     t = case.twists + x
-    held = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
+    pose_cost = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
     share = float(scan.area[points].sum() / scan.area.sum())
+    # Distances within a patch err together: the thickness varies by the gradient of each patch (sandwich), and by no
+    # less than the normal equations say.
     of_patches = np.zeros((len(e), len(H)))
-    np.add.at(of_patches, _patches(scan, index), pulls)
+    np.add.at(of_patches, _patches(scan, index), gradients)
     gain = symmetric_inverse(H)[-1]
-    scattered = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
-    own = rows[:, 6 * case.view : 6 * case.view + 6]
-    over_torn = _over_torn(case, *(column[inside] for column in (own, e, left, weight))) if inside.any() else np.inf
-    sigma = float(np.sqrt(max(scattered, gain[-1])))
-    return _Fit(thickness, sigma, points, share, _evidence(case, left, weight) - held, over_torn)
+    variance = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
+    sigma = float(np.sqrt(max(variance, gain[-1])))
+    of_view = rows[:, 6 * case.view : 6 * case.view + 6]
+    over_torn = np.inf
+    if inside.any():
+        over_torn = _over_torn(case, *(column[inside] for column in (of_view, e, residual, weight)))
+    return _Fit(thickness, sigma, points, share, _evidence(case, residual, weight) - pose_cost, over_torn)
 
 
 def _evidence(case: _Case, left: Array, weight: Array) -> float:

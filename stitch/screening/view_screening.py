@@ -101,37 +101,39 @@ def fit_screened_views(
         InputError: poses contradict the scans, and a usual mistake explains it.
         NoResultError: they do, and none does; too few views are left; groups of views share no surface.
     """
-    left = list(sessions)
+    remaining = list(sessions)
     measured = list(measurements)
-    taken = [ViewScreening() for _ in sessions]
+    # Of all rounds together.
+    found = [ViewScreening() for _ in sessions]
     for _ in range(_MAX_ROUNDS):
-        with _naming_excluded_views(sessions, taken):
-            fitted, screenings = _fit_and_screen(left, measured, fit)
+        with _naming_excluded_views(sessions, found):
+            fitted, screenings = _fit_and_screen(remaining, measured, fit)
             while any(screening.stock for screening in screenings):
                 measured = [
                     replace(m, capture=m.capture.without_stock(screening.stock))
                     for m, screening in zip(measured, screenings, strict=True)
                 ]
-                fitted, screenings = _fit_and_screen(left, measured, fit)
-        taken = [
-            replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, screenings, strict=True)
+                fitted, screenings = _fit_and_screen(remaining, measured, fit)
+        found = [
+            replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(found, screenings, strict=True)
         ]
         if keep or not any(screening.left_out for screening in screenings):
             break
-        for session, screening in zip(sessions, taken, strict=True):
+        for session, screening in zip(sessions, found, strict=True):
             require_majority(session, screening.left_out)
-        for i, (session, screening) in enumerate(zip(left, screenings, strict=True)):
-            gone = [v for v, name in enumerate(session.names) if name in screening.names]
-            measured[i] = measured[i].without(gone)
-        left = [session.without(screening.names) for session, screening in zip(left, screenings, strict=True)]
-        short = next((i for i, session in enumerate(left) if len(session.views) < 2), None)
+        for i, (session, screening) in enumerate(zip(remaining, screenings, strict=True)):
+            left_out = [v for v, name in enumerate(session.names) if name in screening.names]
+            measured[i] = measured[i].without(left_out)
+        remaining = [session.without(screening.names) for session, screening in zip(remaining, screenings, strict=True)]
+        short = next((i for i, session in enumerate(remaining) if len(session.views) < 2), None)
         if short is not None:
-            why = taken[short].line(sessions[short].names)
-            raise NoResultError(f"{left[short].path}: fewer than two views belong together ({why}); to fix: add views")
+            why = found[short].line(sessions[short].names)
+            path = remaining[short].path
+            raise NoResultError(f"{path}: fewer than two views belong together ({why}); to fix: add views")
     else:
-        # The last round has left views out too: what is returned is the fit of those that are left.
-        fitted = fit(left, measured)
-    return ScreenedFit(left, measured, fitted, taken)
+        # The last round has left views out too: what is returned is the fit of those that remain.
+        fitted = fit(remaining, measured)
+    return ScreenedFit(remaining, measured, fitted, found)
 
 
 def _fit_and_screen(
