@@ -98,11 +98,11 @@ class Linearised(Protocol):
     """What was observed, linearised about a model."""
 
     def choose(self, before: Any) -> Any:
-        """What is fitted, given what was so far: None at first."""
+        """Return what is to be fitted, given what was so far; None at first."""
         ...
 
     def solve(self, choice: Any) -> Any:
-        """The `Step` of all unknowns."""
+        """Return the `Step` of all unknowns, with what `choose` returned fitted."""
         ...
 
 

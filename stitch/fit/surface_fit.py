@@ -82,6 +82,7 @@ def fit_surfaces(
     """
 
     def linearise(before: "SurfaceStep | None") -> LinearisedSurfaces:
+        """Return the problem about the first model, or about the one after a step."""
         return linearise_surfaces(measurements, model if before is None else before.model, gates)
 
     history: list[float] = []

@@ -233,6 +233,7 @@ def _register_views(
 
 
 def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str) -> StageResult:
+    """Return a stage of the report with the rms and the number of the correspondences of some overlaps."""
     return StageResult(name, overlaps.gram.rms, int(overlaps.gram.count.sum()), iterations, seconds, note)
 
 

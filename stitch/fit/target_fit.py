@@ -59,6 +59,7 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
     """
 
     def linearise(before: "TargetStep | None") -> LinearisedTargets:
+        """Return the rows about the models of the first sessions, or after a step."""
         if before is None:
             return LinearisedTargets(list(sessions), None)
         return LinearisedTargets(before.solution.sessions, before.solution.variances)
@@ -388,7 +389,7 @@ def _heldout_distances(rows: TargetRows, equations: BlockLeastSquares, blocks: s
 
 
 def _consecutive(lengths: Sequence[int]) -> list[slice]:
-    """Slices of these lengths, one after the other."""
+    """Return slices of these lengths, one after the other."""
     ends = np.cumsum([0, *lengths]).tolist()
     return [slice(first, end) for first, end in pairwise(ends)]
 

@@ -354,7 +354,7 @@ class LinearModel:
         return column_space(self.white_design)
 
     def explained_without(self, views: Indices) -> Array:
-        """(n, r) orthonormal basis of the whitened columns of the model and of free motions of `views` (indices).
+        """Return an orthonormal basis (n, r) of the whitened columns of the model and of free motions of some views.
 
         Projecting it out of the observations leaves these views out of a fit.
         """
@@ -362,11 +362,14 @@ class LinearModel:
         return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
     def residual(self, columns: Array) -> Array:
-        """(n, P) whitened columns, what the model explains projected out; zero where only rounding is left."""
+        """Return the whitened columns (n, P) less their projection onto the model's columns.
+
+        A column that the model explains is exactly zero: what is left of it would be rounding.
+        """
         white = self.whiten(columns)
-        left = white - self._explained @ (self._explained.T @ white)
-        left[:, np.sum(left**2, axis=0) <= _EXPLAINED**2 * np.sum(white**2, axis=0)] = 0.0
-        return left
+        residual = white - self._explained @ (self._explained.T @ white)
+        residual[:, np.sum(residual**2, axis=0) <= _EXPLAINED**2 * np.sum(white**2, axis=0)] = 0.0
+        return residual
 
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Yield I (P, P) and v (P,) per set of columns (n, P): the log likelihood of coefficients θ is vᵀθ − ½ θᵀIθ.

@@ -13,7 +13,6 @@ the views' poses are a sum of processes, each with a covariance of known shape a
 White scatter of the flange in every scan, and the sensor's noise, come with the observation.
 """
 
-from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
@@ -42,18 +41,18 @@ from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 from stitch.session.measurement import Measurement
 from stitch.session.torques import STILL
 
-# What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
-# the flange turns.
+# The component of errors that every joint makes anew in every view, and its usual σ as a share of a plausible joint
+# offset: then the flange turns as much as `_ROTATION`.
 JOINT_SCATTER, USUAL_JOINT_SCATTER = "joint scatter", 0.02
 _OFFSET = "joint_offset"
-# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
+# Effects that every arm has need no other covariates.
 _ARM_COVARIATES = ("joints", "torque")
 # Most of what an arm errs is geometry, about 90 % (Klimchik et al. 2012, Optimization of measurement configurations for
 # geometrical calibration of industrial robot, who do not say whether of the size or its square). Of what gears, play,
 # bending and all that is smooth might do, this share of σ is usual beside it, between the tenth and its root.
 _BESIDE_GEOMETRY = 0.25
 EFFECT_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
-# Usual sizes, rad and mm.
+# Usual σ of what wanders and of stops, rad and mm along each axis of the flange; length_unit per mm.
 _ROTATION, _TRANSLATION = 2e-5, 0.02
 _PER_MM = {"mm": 1.0, "m": 1e-3}
 # What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
@@ -63,9 +62,9 @@ DRIFT_MEMORY = {"quickly wandering": 2.0, "slowly wandering": 20.0}
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.
 _ARM_SCALE, SMOOTH_SCALE = 0.1, 0.03
-# What the scans of a stop share.
+# Components that the scans of a stop share.
 STOP_COMPONENTS = ("stop rotation", "stop translation")
-# Dense matrices of more views take minutes in a fit; there the scatter alone must do.
+# Dense matrices of more views take minutes in a fit: there white scatter alone must do.
 _MOST_VIEWS = 150
 # A diagnosis scores every candidate beside all errors that poses may have, which takes a minute for so many views. From
 # there on poses count as scattering independently, and effects are sought several at once (`diagnosis/regime.py`).
@@ -90,12 +89,9 @@ def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
 
     They depend on joint angles and torques alone. An effect is left out if a session lacks what it needs.
     """
-    possible = [
-        e
-        for e in EFFECTS.values()
-        if e.tier == "physical" and e.place in ("robot", "links") and e.needs and set(e.needs) <= set(_ARM_COVARIATES)
-    ]
-    per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
+    of_arm = [e for e in EFFECTS.values() if e.tier == "physical" and e.place in ("robot", "links")]
+    by_joints = [e for e in of_arm if e.needs and set(e.needs) <= set(_ARM_COVARIATES)]
+    per_joint = [e for e in by_joints if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
     return [e for e in per_joint if not any(missing_need(m, e) for m in measurements)]
 
 
@@ -111,6 +107,14 @@ def effect_twists(measurement: Measurement, model: Model, centre: Array, effects
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     derivatives = pose_derivatives(measurement, model, terms, centre)
     return np.hstack([d.reshape(len(d), -1).T * term.typical for term, d in zip(terms, derivatives, strict=True)])
+
+
+def _rig_twists(
+    measurements: Sequence[Measurement], model: Model, centres: Sequence[Array], effects: Sequence[Effect]
+) -> Array:
+    """Return `effect_twists` (6V, P) of all views of a rig, session after session, each about its centre (3,)."""
+    sessions = zip(measurements, centres, strict=True)
+    return np.concatenate([effect_twists(m, model, centre, effects) for m, centre in sessions])
 
 
 def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
@@ -385,22 +389,19 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     # Covariance and usual σ of each component; by effect its component and its columns.
     components, effects = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
     processes, flange_per_joint = dict[str, SmoothErrors](), np.zeros(2)
-    sessions = list(zip(measurements, centres, strict=True))
     # (V, V) 1 where two views are scans of one stop: they share an error that is drawn once per stop.
     shares_stop = block_diag(*(m.capture.shares_stop for m in measurements))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
-        # Effects of one cause share a size.
-        families = defaultdict[str, list[Array]](list)
-        for e in arm_effects(measurements):
-            columns = np.concatenate([effect_twists(m, model, centre, [e]) for m, centre in sessions])
-            family = EFFECT_FAMILY.get(e.name, e.name)
-            families[family].append(columns)
-            effects[e.name] = (family, columns)
-        for family, members in families.items():
-            components[family] = (np.sum([X @ X.T for X in members], axis=0), _ARM_SCALE)
+        for effect in arm_effects(measurements):
+            columns = _rig_twists(measurements, model, centres, [effect])
+            effects[effect.name] = (EFFECT_FAMILY.get(effect.name, effect.name), columns)
+        # Effects of one family share a size.
+        for family in dict.fromkeys(family for family, _ in effects.values()):
+            squares = [X @ X.T for of_effect, X in effects.values() if of_effect == family]
+            components[family] = (np.sum(squares, axis=0), _ARM_SCALE)
         constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
-        links = np.concatenate([effect_twists(m, model, centre, constant) for m, centre in sessions])
+        links = _rig_twists(measurements, model, centres, constant)
         joint_kernel = rbf_joints(joints)
         components["smooth"] = (process_covariance(links, joint_kernel), SMOOTH_SCALE)
         if constant[0].name == _OFFSET:

@@ -382,6 +382,9 @@ def view_error_likelihood(
     Shared shapes are the same in all views. Those per view are the same in the views of one part of the session: up to
     `_MAX_PARTS` parts follow each other in time, of fewer views each is a part.
 
+    The normal equations M f = vector of all parameters f are Σ w g gᵀ and Σ w g e over the pairs of views, less what
+    motions of the views can absorb.
+
     Args:
         sums: of `sum_smooth_errors` with per_view=True.
         noise: of the scanner along the ray, length_unit.
@@ -399,7 +402,6 @@ def view_error_likelihood(
     M, vector = np.zeros((count, count)), np.zeros(count)
     np.add.at(M, (parameter[:, :, None], parameter[:, None, :]), sums.square)
     np.add.at(vector, parameter, sums.residual)
-    # Less what motions of the views can absorb.
     by_surfaces, by_targets = (_sum_on_views(sums, g, parameter, keep, count) for keep in (~g.labelled, g.labelled))
     on_views = by_surfaces + by_targets
     M -= on_views.T @ solve_view_sums(g, by_surfaces, by_targets)

@@ -203,17 +203,17 @@ def surface_model(
         """Return the variances of a model, fitted, or those of planned views; `names` are its further components."""
         return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))
 
-    # Which effects in use the views show at all, under scatter, noise and the scanner's own errors.
     twists = view_columns(measurement, model, unconstrained)
+    effects = reduced.reduction @ twists
     sizes, values = sizes_of(model.terms), values_of(model.terms)
-    hand_eye_alone = replace(
-        hand_eye_mixed_model(reduced), fixed=_scanner_covariance(measurement, unconstrained, reduced)
-    )
+    scanner_covariance = _scanner_covariance(measurement, unconstrained, reduced)
+    # Which parameters in use the views show at all, under scatter, noise and the scanner's own errors.
+    hand_eye_alone = replace(hand_eye_mixed_model(reduced), fixed=scanner_covariance)
     root = np.linalg.cholesky(hand_eye_alone.covariance(fit_null(hand_eye_alone).variances)[0])
     white_hand_eye = np.linalg.solve(root, reduced.hand_eye).astype(float)
-    white_effects = np.linalg.solve(root, reduced.reduction @ twists).astype(float)
+    white_effects = np.linalg.solve(root, effects).astype(float)
     seen = independent(white_hand_eye, white_effects, sizes, _UNSEEN)
-    mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=hand_eye_alone.fixed)
+    mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=scanner_covariance)
     errors = None
     if measurement.views.count < MANY_VIEWS:
         errors = prior_pose_errors([measurement], model, [gram.centre]).project(reduced.reduction)
