@@ -192,11 +192,11 @@ def match_pairs(
     gate: float,
     samples: Sequence[Indices],
     before: Searched | None = None,
-    turns: Indices | None = None,
+    strides: Indices | None = None,
 ) -> tuple[list[Match], Searched]:
     """Return the correspondences of each pair of views that has some, and the search, for the next call's `before`.
 
-    Each sampled point is matched with the nearest usable point of the other view, in both directions. With t turns,
+    Each sampled point is matched with the nearest usable point of the other view, in both directions. With a stride t
     every t-th point of a view is searched in each other view, different points in different views: so the cost grows
     with the number of views, not with its square.
 
@@ -206,15 +206,15 @@ def match_pairs(
         gate: largest distance between corresponding points, length_unit.
         samples: per view the numbers of the points that are searched (see `sample_points`).
         before: a search under other poses: nearest points that cannot have changed are taken from it. None: all anew.
-        turns: (V,) t of each view; None: as many as make a point be searched in about `_MOST_PARTNERS` views.
+        strides: (V,) t of each view; None: so large that a point is searched in about `_MOST_PARTNERS` views.
     """
-    if turns is None:
-        turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
+    if strides is None:
+        strides = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
     # Per view, the points of other views that are searched in it.
     parts = [list[QueryPart]() for _ in scans]
     for v, w in pairs:
         for view, searched in ((v, w), (w, v)):
-            parts[searched].append((view, slice(searched % turns[view], None, turns[view])))
+            parts[searched].append((view, slice(searched % strides[view], None, strides[view])))
     queries = neighbour_queries(scans, poses, samples)
     # Only the queries whose nearest point may have changed; None: all.
     still_open = None if before is None else before.still_open(queries, parts, gate)

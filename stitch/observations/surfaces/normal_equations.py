@@ -75,7 +75,7 @@ class Overlaps(Value):
     targets: "TargetPairs | None" = None
     probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
     searched: Searched | None = None  # nearest points, for the next iteration; None: it searches all anew
-    turns: Indices | None = None  # (V,) every t-th point of a view is searched in a partner; None: `match_pairs` says
+    strides: Indices | None = None  # (V,) every t-th point of a view is searched in a partner; None: `match_pairs` says
 
 
 def collect_overlaps(
@@ -98,14 +98,14 @@ def collect_overlaps(
         NoResultError: no two views overlap.
     """
     if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
-        pairs, turns = before.pairs, before.turns
+        pairs, strides = before.pairs, before.strides
         probed, searched = before.probed, before.searched
     else:
-        pairs, turns = find_partners(capture.scans, poses, gate, at_most=max(map(len, samples)))
+        pairs, strides = find_partners(capture.scans, poses, gate, at_most=max(map(len, samples)))
         probed, searched = (np.array(poses), gate), None
-    if turns is not None:
-        samples = more_points(capture.scans, samples, turns)
-    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched, turns)
+    if strides is not None:
+        samples = more_points(capture.scans, samples, strides)
+    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched, strides)
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
@@ -114,7 +114,7 @@ def collect_overlaps(
     surfaces = sum_matches(matches, len(capture.scans))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
     g = append_targets(surfaces, targets, capture.noise_factor)
-    return Overlaps(pairs, matches, g, gate, targets, probed, searched, turns)
+    return Overlaps(pairs, matches, g, gate, targets, probed, searched, strides)
 
 
 def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:

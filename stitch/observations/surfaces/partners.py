@@ -40,10 +40,10 @@ _FOUND, _MORE_POINTS = 5.5, 1.3
 def find_partners(
     scans: Sequence[Scan], poses: Array, gate: float, at_most: int
 ) -> tuple[list[tuple[int, int]], Indices | None]:
-    """Return the pairs of views (v < w) whose points are matched, and the number of turns (V,) of each view.
+    """Return the pairs of views (v < w) whose points are matched, and the stride t (V,) of each view.
 
-    With t turns every t-th point of a view is searched in each partner, the partners taking different points. Of up to
-    `_ALL_PARTNERS` views the pairs are all that overlap, and the turns None: `match_pairs` then chooses them.
+    Every t-th point of a view is searched in each partner, the partners taking different points in turn. Of up to
+    `_ALL_PARTNERS` views the pairs are all that overlap, and the strides None: `match_pairs` then chooses them.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
@@ -59,20 +59,20 @@ def find_partners(
         shares[v, w] = share
     meet = np.maximum(shares, shares.T) >= MINIMUM_OVERLAP
     kept = _best_of(shares + shares.T, meet)
-    turns = np.maximum(np.round((shares * kept).sum(axis=1) / _FOUND), 1).astype(np.int64)
-    return [(v, w) for v, w in near if kept[v, w]], turns
+    strides = np.maximum(np.round((shares * kept).sum(axis=1) / _FOUND), 1).astype(np.int64)
+    return [(v, w) for v, w in near if kept[v, w]], strides
 
 
-def more_points(scans: Sequence[Scan], samples: Sequence[Indices], turns: Indices) -> list[Indices]:
-    """Return per view the numbers of the points that are searched: `_MORE_POINTS` times as many where turns are taken.
+def more_points(scans: Sequence[Scan], samples: Sequence[Indices], strides: Indices) -> list[Indices]:
+    """Return per view the numbers of the points to search: `_MORE_POINTS` times as many where the stride exceeds 1.
 
     Args:
-        samples: per view the numbers of its points without turns.
-        turns: (V,) as `find_partners` returns them; 1: every point is searched in every partner.
+        samples: per view the numbers of its points where every one is searched in every partner.
+        strides: (V,) as `find_partners` returns them.
     """
     return [
-        sample_points(scan, round(_MORE_POINTS * len(index))) if turn > 1 else index
-        for scan, index, turn in zip(scans, samples, turns, strict=True)
+        sample_points(scan, round(_MORE_POINTS * len(index))) if stride > 1 else index
+        for scan, index, stride in zip(scans, samples, strides, strict=True)
     ]
 
 
