@@ -36,12 +36,13 @@ SOURCES = {
     ANOTHER_ARM: "the arm model of another run",
     "unseen": "directions that these views do not constrain",
 }
-# Residuals within a quarter of the noise floor's square are noise; above, something else is there.
+# An rms of at most so many times the noise floor, its square by a fifth larger, is the noise; above, something else.
 _NEAR_FLOOR = 1.1
 # Sigmas that were widened by more than this factor on the variance are worth a note.
 _WIDENED = 2.5
 # Of fewer degrees of freedom what is usual for arms counts as much as what the views show: seven views leave 30.
 _FEW_DEGREES = 30
+# Outliers that are named; the others are counted.
 _LISTED = 12
 # Moves along surfaces of so many robust sigmas of the overlaps are worth a note.
 _SLID = 20.0
@@ -81,10 +82,10 @@ def register_note(registration: Registration, session: SessionData, unseen: Arra
         unseen: (V,) how far register moved each view in directions that no overlap shows, length_unit.
     """
     lines = []
-    for v, size in registration.offsets.items():
-        side = "outside" if size > 0 else "inside"
-        apart = length_text(abs(size), session.length_unit)
-        lines.append(f"{session.names[v]} lies as a whole {side} the other views, by {apart}")
+    for v, offset in registration.offsets.items():
+        side = "outside" if offset > 0 else "inside"
+        distance = length_text(abs(offset), session.length_unit)
+        lines.append(f"{session.names[v]} lies as a whole {side} the other views, by {distance}")
     if unseen.max(initial=0.0) > _SLID * registration.overlaps.gram.scale:
         farthest = length_text(float(unseen.max()), session.length_unit, 2)
         lines.append(f"views slide along these surfaces unseen, here by up to {farthest}: such moves mean nothing")
@@ -172,15 +173,16 @@ def warnings(start: CoarseHandEye, hand_eye: HandEyeFit) -> tuple[str, ...]:
 
 def _largest_sources(hand_eye: HandEyeFit) -> str:
     """Return a sentence that names the largest source of the variance of rotation and of position, with its share."""
-    (turn, of_turn), (shift, of_shift) = (
+    (of_rotation, rotation_share), (of_position, position_share) = (
         max(shares.items(), key=lambda item: item[1]) for shares in (hand_eye.rotation_shares, hand_eye.position_shares)
     )
-    first, second = (SOURCES.get(source, source) for source in (turn, shift))
-    if turn == shift:
-        return f"Most of its variance may come from {first}: {of_turn:.0%} in rotation, {of_shift:.0%} in position."
+    first, second = (SOURCES.get(source, source) for source in (of_rotation, of_position))
+    if of_rotation == of_position:
+        shares = f"{rotation_share:.0%} in rotation, {position_share:.0%} in position"
+        return f"Most of its variance may come from {first}: {shares}."
     return (
-        f"Most of its variance in rotation may come from {first} ({of_turn:.0%}). "
-        f"In position it may come from {second} ({of_shift:.0%})."
+        f"Most of its variance in rotation may come from {first} ({rotation_share:.0%}). "
+        f"In position it may come from {second} ({position_share:.0%})."
     )
 
 
@@ -210,10 +212,8 @@ def view_notes(
 def target_notes(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, clouds that were not used, and a widened covariance."""
     notes = _unused_points(targets, outliers, session)
-    fitted, most = (
-        targets.rows.sightings.target.shape[1],
-        max(len(v.sighting.targets) for v in session.views if v.sighting),
-    )
+    fitted = targets.rows.sightings.target.shape[1]
+    most = max(len(view.sighting.targets) for view in session.views if view.sighting)
     if fitted < most:
         notes.append(
             f"Of {most} labelled points of a view at most {fitted} were fitted, others in each view: more take memory "

@@ -84,7 +84,7 @@ def scan_odometry(
     config.data.max_range = 1e6
     config.data.deskew = times is not None
     odometry = KissICP(config)
-    odometry.preprocessor = _ToTheTimeOfTheScan(odometry.preprocessor, interval)
+    odometry.preprocessor = _MotionCorrection(odometry.preprocessor, interval)
     poses = []
     for v, points in enumerate(scans):
         if predicted is not None and v:
@@ -129,7 +129,7 @@ def hand_eye_of_stream(
     return T_mount, odometry
 
 
-class _ToTheTimeOfTheScan:
+class _MotionCorrection:
     """A preprocessor for KISS-ICP that moves the points of each scan to where the scanner saw them at the scan's time.
 
     KISS-ICP's own takes for granted that a scan lasts until the next one, and refers its points to the time of the last

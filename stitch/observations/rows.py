@@ -126,8 +126,8 @@ class Rows(ABC):
     def scattered(self) -> tuple[Array, Array]:
         """(V, m, 3) changes of the rows per rotation, and per translation, of the flange in its own frame."""
         to_centre = frames.make(np.eye(3), -self.centre)
-        carried = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
-        return carried[..., :3], carried[..., 3:]
+        per_flange_twist = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
+        return per_flange_twist[..., :3], per_flange_twist[..., 3:]
 
     @cached_property
     def _common_covariance(self) -> CommonCovariance | None:

@@ -494,11 +494,10 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Captur
     """
     seen = g.visible
     reduction = seen.vectors.T / seen.scale
-    to_centre = frames.make(np.eye(3), -g.centre)
-    response = reduction @ hand_eye_jacobian(hand_eye_frames, g.centre)
-    carried = frames.adjoint(to_centre @ capture.T_reference_flange)
+    # Left twists of the views per right twist of the flange.
+    per_flange_twist = frames.adjoint(frames.make(np.eye(3), -g.centre) @ capture.T_reference_flange)
     # (V, n, 6) visible directions per unit rotation and translation of the flange in each view.
-    blocks = reduction.reshape(len(reduction), -1, 6).transpose(1, 0, 2) @ carried
+    blocks = reduction.reshape(len(reduction), -1, 6).transpose(1, 0, 2) @ per_flange_twist
     if capture.stop is not None:
         # Views scanned at one stop share its scatter: their blocks are added.
         by_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
@@ -507,7 +506,7 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Captur
         reduction=reduction,
         expansion=seen.scale[:, None] * seen.vectors,
         z=reduction @ twists.reshape(-1),
-        hand_eye=response,
+        hand_eye=reduction @ hand_eye_jacobian(hand_eye_frames, g.centre),
         rotation=summed_squares(blocks[..., :3]),
         translation=summed_squares(blocks[..., 3:]),
         noise=np.diag(g.variance / seen.values),
