@@ -22,12 +22,15 @@ from stitch.session.capture import Capture, build_capture, part_size, with_scann
 from stitch.session.measurement import Measurement, measurement_of
 from stitch.session.session import SessionData
 
-# Random sets of rotations that are tried, those that are improved, and the angle, rad, at which one motion's is capped.
-_DRAWS, _IMPROVED, _OFF = 20_000, 24, 0.3
+# Random sets of rotations that are tried, those that are improved, and those that differ and are kept.
+_DRAWS, _IMPROVED, _MOST_ANSWERS = 20_000, 24, 4
+# Angle, rad, at which a motion's error is capped: a larger one is a wrong registration.
+_OFF = 0.3
 # A motion is explained within so many rad and so much of the part's size.
 _ANGLE, _SHARE = 0.03, 0.03
-# Fewer explained motions place no axis; of so many unknowns a third of what they say.
+# Fewer explained motions place no axis: they say three times as many numbers as there are unknowns.
 _FEWEST = 5
+# Sets of rotations whose angles are computed at once: bounds the memory.
 _BLOCK = 500
 # Partners of a view by their orientation; weighted solutions for places.
 _ALIKE, _REWEIGHTED = 3, 20
@@ -293,7 +296,7 @@ def _likely_rotations(motions: _Motions, T_mount: Array | None) -> list[tuple[Ar
         d, R = trials[i]
         if all(frames.angle_between(R, R2) > _ANGLE or np.abs(d - d2).max() > _ANGLE for d2, R2 in distinct):
             distinct.append((d, R))
-    return distinct[:4]
+    return distinct[:_MOST_ANSWERS]
 
 
 def _improved_rotations(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:

@@ -26,7 +26,6 @@ from stitch.observations.surfaces.hand_eye_fit import (
     fit_hand_eye,
     hand_eye_jacobian,
     solve_hand_eye,
-    step_hand_eye,
 )
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import (
@@ -122,10 +121,11 @@ def correct(
     unconstrained = tuple(
         unconstrained_poses(c, c.poses(T_mount), gate, o) for c, gate, o in zip(captures, gates, overlaps, strict=True)
     )
-    T_first, scatters = step_hand_eye(captures, unconstrained, T_mount)
+    first = solve_hand_eye(captures, unconstrained, T_mount)
+    T_first = first.T_mount
     require_near_scanner(captures, T_first)
     # With large pose errors the step is not linear, and what is not would count as noise: hence a second one.
-    captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
+    captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, first.scatter, strict=True)]
     # The new noise factor changes how clouds weigh beside labelled points: where there are such, views are moved anew.
     unconstrained = tuple(
         f.relative_to(c.poses(T_first)) if c.sightings is None else unconstrained_poses(c, c.poses(T_first), gate)

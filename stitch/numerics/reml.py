@@ -527,9 +527,9 @@ def fit_variances(
         maximum = fisher_scoring(problem, begin, flat) if present.all() else None
         if maximum is None:
             log_variances = search(np.clip(begin, *np.array(bounds).T)).x
-            fits.append(_fit_at(problem, np.where(present, np.exp(log_variances), 0.0)))
+            fits.append(_fit_at(np.where(present, np.exp(log_variances), 0.0), problem))
         else:
-            fits.append(_as_variance_fit(np.exp(maximum.log_variances), maximum))
+            fits.append(_fit_at(np.exp(maximum.log_variances), problem, maximum))
     return min(fits, key=lambda fit: fit.deviance)
 
 
@@ -542,16 +542,16 @@ def at_variances(
         G: (B, m, g) further columns of the mean, or the same prepared for several fits; None: none.
         prior: (g,) standard deviations of their coefficients; None: they are free.
     """
-    return _fit_at(reml_problem(mixed, G, prior), np.asarray(variances))
+    return _fit_at(np.asarray(variances), reml_problem(mixed, G, prior))
 
 
-def _fit_at(problem: RemlProblem, variances: Array) -> VarianceFit:
-    """Return the fit of a problem at given variances (c,), which may be zero."""
-    return _as_variance_fit(variances, likelihood(np.log(np.maximum(variances, _ABSENT)), problem))
+def _fit_at(variances: Array, problem: RemlProblem, solution: Likelihood | None = None) -> VarianceFit:
+    """Return the fit at variances (c,), which may be zero.
 
-
-def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
-    """Return what is kept of a likelihood, as the fit at `variances` (c,)."""
+    Args:
+        solution: the likelihood there; None: it is computed.
+    """
+    solution = solution or likelihood(np.log(np.maximum(variances, _ABSENT)), problem)
     mean, covariance = solution.mean, solution.covariance
     return VarianceFit(variances, solution.deviance, mean, covariance, solution.sums, solution.of_variances)
 

@@ -163,11 +163,11 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
     shares, free = likelihood.ml_shares()
 
     def gain_over(limit: float) -> float:
-        """Return the log likelihood, nats, that is lost if the cause has at most this share."""
+        """Return the log likelihood, nats, that a free share of the cause gains over one of at most `limit`."""
         return 0.5 * (likelihood.ml_shares({cause: limit})[1] - free)
 
     def is_significant(gain: float) -> bool:
-        """Return True if a loss of log likelihood is significant at level `alpha`.
+        """Return True if a gain of log likelihood is significant at level `alpha`.
 
         The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
         """

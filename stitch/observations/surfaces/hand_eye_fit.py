@@ -444,14 +444,6 @@ def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) ->
     return sigma[:, None] * null_space(visible.T, rcond=1e-9)
 
 
-def step_hand_eye(
-    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array
-) -> tuple[Array, tuple[Repeatability, ...]]:
-    """Return T_mount (4, 4) by one step of `solve_hand_eye` without effects, and how the poses scatter, per capture."""
-    solution = solve_hand_eye(captures, unconstrained, T_mount)
-    return solution.T_mount, solution.scatter
-
-
 def weak_prior(
     captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array, effects: Array
 ) -> Array:
