@@ -156,13 +156,13 @@ class _Motions:
         x[free] += step
         axes = []
         for k, axis in enumerate(self.axes.axes):
-            travel = x[6 + 6 * k : 9 + 6 * k]
+            way = x[6 + 6 * k : 9 + 6 * k]
             if axis.is_placed:
                 axes.append(axis)
             elif axis.is_rotary:
                 axes.append(replace(axis, direction=directions[k], point=x[3 + 6 * k : 6 + 6 * k]))
-            elif np.linalg.norm(travel) > 0:
-                axes.append(replace(axis, direction=travel / np.linalg.norm(travel)))
+            elif np.linalg.norm(way) > 0:
+                axes.append(replace(axis, direction=way / np.linalg.norm(way)))
             else:
                 return None
         return tuple(axes), frames.make(R_mount, x[:3])

@@ -418,7 +418,8 @@ def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) ->
         "raw_square": zeros,
         "labelled": np.ones(len(pairs), bool),
     }
-    return replace(g, **{name: np.concatenate([getattr(g, name), of_targets[name]]) for name in _PAIR_FIELDS})
+    joined: dict[str, Any] = {name: np.concatenate([getattr(g, name), of_targets[name]]) for name in _PAIR_FIELDS}
+    return replace(g, **joined)
 
 
 def sum_by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:
