@@ -22,7 +22,7 @@ class Scanners:
     """The K scanners of V views of a joined session; empty, and false, for a session of one scanner."""
 
     names: tuple[str, ...] = ()
-    of_view: Indices = field(default_factory=partial(np.zeros, 0, np.int64))  # (V,) index of each view's scanner
+    of_view: Indices = field(default_factory=partial(np.arange, 0))  # (V,) index of each view's scanner
     T_first: Array = field(default_factory=partial(np.zeros, (0, 4, 4)))  # (K, 4, 4) T_scanner1_scanner, to begin with
     standoff: tuple[float | None, ...] = ()  # length_unit; None: not stated
 
