@@ -114,8 +114,7 @@ def run_rig(
         True
     """
     _require_sessions(sessions)
-    told: Sequence[Recorder | None] = recorders or [None] * len(sessions)
-    replays = [ReplayRecorder(recorder, progress) for recorder in told]
+    replays = [ReplayRecorder(recorder, progress) for recorder in recorders or (None,) * len(sessions)]
     known_model, kept_arm = _models(model, arm)
     known_effects = [find_effect(name).name for name in _names(effects)]
     runs = pipeline.run_rig(sessions, known_model, replays, known_effects, keep, kept_arm, register=register)
