@@ -87,7 +87,10 @@ class DecidingViews:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival predicts of N further views, m numbers each: a normal distribution in three parts."""
+    """What a rival predicts of N further views: a normal distribution of m numbers each, its covariance in three parts.
+
+    The numbers are the six of a view's twist, or the residuals of its targets.
+    """
 
     mean: Array  # (N, m)
     coefficient_root: Array  # (N, m, q) root of the covariance by coefficients that the views taken leave uncertain
@@ -96,7 +99,7 @@ class Prediction:
     design: Array  # (N, m, a) of hand-eye and effects in use
 
     def of(self, chosen: Sequence[int], more: Indices) -> tuple[Array, Array]:
-        """Return mean (C, D) and covariance (C, D, D) of C sets of views: those chosen already, and one of `more`.
+        """Return mean (C, D) and covariance (C, D, D) of what C sets of views show: those chosen, and one of `more`.
 
         D = m (number chosen + 1).
 

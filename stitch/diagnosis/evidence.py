@@ -122,10 +122,13 @@ def does_the_scanner_explain_it(case: Case, evidence: Evidence) -> Reply | None:
 
 
 def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
-    """Of few views: does a name that fell hold beside a second effect?
+    """Of few views: does the effect that was proposed and then refuted hold beside a second effect?
 
     A second effect that is not in the model can make the first look different in each half of the views, or look like
-    a smooth error of the scanner. Then a name that was refuted is proposed again, with the second.
+    a smooth error of the scanner. Then the refuted effect is proposed again, with the second:
+    the answer "yes" sets both as missing.
+
+    None, not asked, where an effect is named as it is, none was refuted, or the views are many.
     """
     proposed = evidence.proposed
     if proposed is None or proposed.verdict != "missing_effect" or evidence.named or case.many_views:

@@ -241,7 +241,8 @@ def untested_ends_reason(names: Sequence[str]) -> str:
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     """Return how well a candidate predicts views at the ends of joint ranges, each end from all other views.
 
-    None where the views are too few to leave an end out.
+    A share is the sum of squares that a fit with the candidate leaves there, over that of a fit without it; below 1 it
+    helps. None where the views are too few to leave an end out.
     """
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:

@@ -114,7 +114,7 @@ class CoarseHandEye:
 
 
 def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
-    """Return a known hand-eye as the start of the correction, with a gate wide enough for errors of 5° and 30 mm.
+    """Return a known hand-eye as the start of the correction, with the widest gate: `COARSE_GATE` of the part's size.
 
     Args:
         T_mount: (4, 4) maps scanner to mount.

@@ -129,7 +129,8 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """Return posterior means (c,) of the variances, by Gibbs sampling on a grid of each, from their maximum on.
 
     In each round every variance is drawn given the others, and its conditional mean is what is averaged. Then the
-    common factor on usual sizes is drawn. The first rounds are not counted.
+    factor is drawn by which the prior's usual sizes of some components are multiplied together (`common_factor`): an
+    arm may err more than usual in all of them. The first rounds are not counted. Components that are zero have mean 0.
 
     The maximum itself is returned from `_NO_ROUNDS` observations on, where a round takes seconds, and where the mean
     leaves no observation over.

@@ -206,11 +206,13 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
 def _row_where_it_fits(
     capture: Capture, snooping: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
 ) -> int | None:
-    """Return the row at whose pose a scan fits the surface after the smallest motion; None if that is its own.
+    """Return the row of the table of poses at whose pose a scan fits the surface after the smallest motion.
+
+    None if it fits at its own row, whatever the others need, or at none.
 
     Args:
         surface: of the views that belong together.
-        view: number of the scan.
+        view: number of the scan, and of its own row.
         rows: numbers of the rows that are tried.
     """
     near = CLOSE_SHARE * part_size([capture])
