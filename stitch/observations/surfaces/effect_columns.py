@@ -73,7 +73,7 @@ def view_responses(
         sums = stream_point_sums(
             unconstrained,
             measurement.capture.noise_factor,
-            lambda v, index: slopes.at(v, unconstrained.poses[v], index),
+            lambda v, index, normal: motion_along_normals(slopes, v, unconstrained.poses[v], index, normal),
             lambda: slopes.at_targets(unconstrained.poses),
         )
     twists = apparent_twists(sums, unconstrained) if sums else None
@@ -105,7 +105,7 @@ def apparent_twists(points: PointGram, unconstrained: UnconstrainedPoses) -> Arr
 def stream_point_sums(
     unconstrained: UnconstrainedPoses,
     noise_factor: float,
-    of_points: Callable[[int, Indices], Array],
+    of_points: Callable[[int, Indices, Array], Array],
     of_targets: Callable[[], Array],
     per_view: int = 0,
 ) -> PointGram:
@@ -117,9 +117,9 @@ def stream_point_sums(
 
     Args:
         noise_factor: variance between surfaces over that of independent noise; labelled points are weighted by it.
-        of_points: called with a view and numbers (N,) of its points; returns how far these move per unit of each
-            parameter, (K, N, 3), scanner frame, length_unit.
-        of_targets: returns the same for all labelled points, (K, V, S, 3).
+        of_points: called with a view, numbers (N,) of its points and unit normals there (N, 3), scanner frame; returns
+            how far the points move along them per unit of each parameter, (N, K), length_unit.
+        of_targets: returns how all labelled points move per unit, (K, V, S, 3), scanner frame, length_unit.
         per_view: the first `per_view` of the K have a value of their own in each view. The sums then hold them twice,
             for the first and for the second view of a pair, before the others.
     """
@@ -127,10 +127,7 @@ def stream_point_sums(
 
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """Return how far (N, K) points `index` of view v move along normals (N, 3), reference frame, per unit."""
-        in_scanner = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
-        # A point has several partners, and moves alike for all.
-        points, position = np.unique(index, return_inverse=True)
-        return np.einsum("kni,ni->nk", of_points(v, points).take(position, axis=1), in_scanner)
+        return of_points(v, index, frames.rotate(frames.inverse(unconstrained.poses[v]), normal))
 
     # By number of the match, so of the pair: Σ w Bᵀg, Σ w g e and Σ w g gᵀ, summed over its parts.
     sums = dict[int, tuple[Array, ...]]()
@@ -148,6 +145,19 @@ def stream_point_sums(
     rows += _target_pair_sums(unconstrained, noise_factor, of_targets, per_view)
     vectors, residuals, squares = (np.array(column) for column in zip(*rows, strict=True))
     return PointGram(vectors, residuals, squares)
+
+
+def motion_along_normals(slopes: PointSlopes, v: int, pose: Array, index: Indices, normal: Array) -> Array:
+    """Return how far points of view v move along unit normals (N, 3), scanner frame, per unit of P parameters: (N, P).
+
+    Args:
+        slopes: of the parameters.
+        pose: (4, 4) T_reference_scanner of the view.
+        index: (N,) numbers of the points, which may come more than once.
+    """
+    # A point has several partners, and moves alike for all.
+    points, position = np.unique(index, return_inverse=True)
+    return np.einsum("kni,ni->nk", slopes.at(v, pose, points).take(position, axis=1), normal)
 
 
 def _split_by_view(changes: Array, per_view: int) -> Array:

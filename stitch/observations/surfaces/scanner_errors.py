@@ -19,7 +19,12 @@ from scipy.optimize import minimize
 
 from stitch.model.forward import PointSlopes
 from stitch.numerics.frames import Array, Indices, Mask
-from stitch.observations.surfaces.effect_columns import PointGram, apparent_twists, stream_point_sums
+from stitch.observations.surfaces.effect_columns import (
+    PointGram,
+    apparent_twists,
+    motion_along_normals,
+    stream_point_sums,
+)
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, SCANNER_SCALE
 from stitch.observations.surfaces.normal_equations import Gram
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums, visible_step
@@ -118,9 +123,9 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
     capture = measurement.capture
     is_own = np.array(scanners.masks(len(capture.scans)))
 
-    def scaled(v: int, index: Indices) -> Array:
-        """Return what undoes a unit of each scanner's scale for points of view v, (K, N, 3), scanner frame."""
-        return -capture.scans[v].points[index] * is_own[:, v, None, None]
+    def scaled(v: int, index: Indices, normal: Array) -> Array:
+        """Return how far what undoes a unit of each scanner's scale moves points of view v along normals, (N, K)."""
+        return -np.sum(capture.scans[v].points[index] * normal, axis=1)[:, None] * is_own[:, v]
 
     def scaled_targets() -> Array:
         """Return the same for all labelled points, (K, V, S, 3)."""
@@ -147,7 +152,7 @@ def sum_smooth_errors(
         point_effects: further effects that move points; None: none.
         per_view: True: each of the COARSE shapes has a coefficient of its own in each view, so that the sums hold them
             twice (`stream_point_sums`); and after incidence come further shapes that all views share
-            (`_shared_shapes`).
+            (`error_shapes` with a standoff).
         views: (V,) bool, the views of the one scanner that has the errors; None: all have them.
     """
     capture = measurement.capture
@@ -155,19 +160,19 @@ def sum_smooth_errors(
     half = half_field(measurement, has_errors)
     further = point_effects or PointSlopes(measurement, ())
     scans = [scan for scan, has_them in zip(capture.scans, has_errors, strict=True) if has_them]
-    standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in scans])))
+    standoff = None
+    if per_view:
+        standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in scans])))
 
-    def corrections(away: Array, cosine: Array) -> Array:
-        """Return how unit parameters move points (K, N, 3) on rays (N, 3) from the eye, of incidence cosine (N,)."""
-        corrected = smooth_corrections(away, cosine, half)
-        return np.concatenate([corrected, _shared_shapes(away, half, standoff)]) if per_view else corrected
-
-    def of_points(v: int, index: Indices) -> Array:
-        """Return how unit parameters move points of view v, (K, N, 3), scanner frame."""
+    def of_points(v: int, index: Indices, normal: Array) -> Array:
+        """Return how far points of view v move along normals (N, 3), scanner frame, per unit of each, (N, K)."""
         scan = capture.scans[v]
-        smooth = corrections(scan.points.take(index, axis=0) - scan.eye, measurement.scan_views[v].cosine[index])
-        smooth = smooth if has_errors[v] else np.zeros_like(smooth)
-        return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
+        away = scan.points.take(index, axis=0) - scan.eye
+        shapes = error_shapes(away, measurement.scan_views[v].cosine[index], half, standoff)
+        smooth = shapes.along_normals(normal) * has_errors[v]
+        if not further.terms:
+            return smooth
+        return np.hstack([smooth, motion_along_normals(further, v, unconstrained.poses[v], index, normal)])
 
     def of_targets() -> Array:
         """Return how unit errors move the labelled points (K, V, S, 3), sensor frame, length_unit."""
@@ -175,7 +180,7 @@ def sum_smooth_errors(
         points, is_filled = capture.sightings.points, capture.sightings.target >= 0
         # An empty slot gets some ray; the incidence is taken as straight, since nobody knows it.
         rays = np.where(is_filled[..., None], points, [0.0, 0.0, 1.0]).reshape(-1, 3)
-        moved = corrections(rays, np.ones(len(rays))).reshape(-1, *points.shape)
+        moved = error_shapes(rays, np.ones(len(rays)), half, standoff).vectors.reshape(-1, *points.shape)
         smooth = np.where((is_filled & has_errors[:, None])[..., None], moved, 0.0)
         return np.concatenate([smooth, further.at_targets(unconstrained.poses)])
 
@@ -198,40 +203,51 @@ def half_field(measurement: Measurement, views: Mask | None = None) -> Array:
     return np.maximum(np.quantile(slopes, _FIELD_QUANTILE, axis=0), 1e-6)
 
 
-def smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
-    """Return the corrections (COARSE + 1, N, 3) of N points per unit of each smooth error, scanner frame.
+@dataclass(frozen=True)
+class ErrorShapes:
+    """How N points move, scanner frame, per unit of each of K smooth errors: A along the ray, then 2B across it."""
 
-    They lie along the ray, opposite to the error: COARSE Legendre products over the field, whose rms is 1 together,
-    and 1/cos − 1 of the angle of incidence.
+    ray: Array  # (N, 3) unit vectors from the scanner's eye to the points
+    along: Array  # (A, N) by each error along the ray
+    across: Array  # (B, N) along the scanner's x by one error, and as far along its y by the next
+
+    @property
+    def vectors(self) -> Array:
+        """(K, N, 3) the movements."""
+        across = self.across[:, None, :, None] * np.eye(3)[:2, None]
+        return np.concatenate([self.along[..., None] * self.ray, across.reshape(-1, *self.ray.shape)])
+
+    def along_normals(self, normal: Array) -> Array:
+        """Return the movements (N, K) along unit normals (N, 3), scanner frame."""
+        by_ray = np.sum(self.ray * normal, axis=1)[:, None] * self.along.T
+        across = self.across.T[:, :, None] * normal[:, None, :2]
+        return np.hstack([by_ray, across.reshape(len(normal), -1)])
+
+
+def error_shapes(away: Array, cosine: Array, half: Array, standoff: float | None = None) -> ErrorShapes:
+    """Return how N points move per unit of each smooth error that a scanner may have.
+
+    First come corrections along the ray, opposite to the error: COARSE Legendre products over the field, whose rms is 1
+    together, and 1/cos − 1 of the angle of incidence. With a standoff come further errors, all about as large as one:
+    along the ray finer Legendre products and powers of the range, across it slopes and squares over the field, and the
+    range. A scanner with skew axes or a nonlinear scale is a combination of these.
 
     Args:
         away: (N, 3) from the scanner's eye to the points.
         cosine: (N,) of the angle of incidence.
         half: (2,) half width and height of the field, of `half_field`.
+        standoff: median range, length_unit, from which the range is counted as a share; None: corrections alone.
     """
-    along = [*legendre_products(away, half, _DEGREE), 1 / cosine - 1]
-    return -np.array(along)[..., None] * (away / np.linalg.norm(away, axis=1)[:, None])
-
-
-def _shared_shapes(away: Array, half: Array, standoff: float) -> Array:
-    """Return shapes (S, N, 3) of further errors that all views may share, at N points, in the scanner's frame.
-
-    Along the ray: finer Legendre products over the field, powers of the range. Across the ray, along x and y: slopes
-    and squares over the field, and the range. All are about as large as one; a scanner with skew axes or a nonlinear
-    scale is a combination of them.
-
-    Args:
-        away: (N, 3) from the scanner's eye to the points.
-        half: (2,) half width and height of the field, of `half_field`.
-        standoff: median range, length_unit, from which the range is counted as a share.
-    """
-    ray = away / np.linalg.norm(away, axis=1)[:, None]
-    distance = np.linalg.norm(away, axis=1) / standoff - 1
-    a, b = away[:, :2].T / away[:, 2] / half[:, None]
-    fine = legendre_products(away, half)[COARSE:]
-    along = [*fine, distance, distance**2, distance**3, distance * a, distance * b]
-    across = [shape[:, None] * axis for shape in (a, b, a**2, a * b, b**2, distance) for axis in np.eye(3)[:2]]
-    return np.concatenate([np.array(along)[..., None] * ray, np.array(across)])
+    length = np.linalg.norm(away, axis=1)
+    products = legendre_products(away, half, _DEGREE if standoff is None else _FINE_DEGREE)
+    along = [-shape for shape in (*products[:COARSE], 1 / cosine - 1)]
+    across = list[Array]()
+    if standoff is not None:
+        distance = length / standoff - 1
+        a, b = away[:, :2].T / away[:, 2] / half[:, None]
+        along += [*products[COARSE:], distance, distance**2, distance**3, distance * a, distance * b]
+        across = [a, b, a**2, a * b, b**2, distance]
+    return ErrorShapes(away / length[:, None], np.array(along), np.array(across).reshape(-1, len(away)))
 
 
 def legendre_products(away: Array, half: Array, degree: int = _FINE_DEGREE) -> list[Array]:

@@ -8,7 +8,7 @@ import numpy as np
 from stitch.model.forward import PointSlopes
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
-from stitch.observations.surfaces.scanner_errors import smooth_corrections
+from stitch.observations.surfaces.scanner_errors import error_shapes
 from stitch.plugins.metrology.scan_errors import ScanErrors
 from stitch.run_data import FusedCloud
 from stitch.session.capture import Capture
@@ -125,7 +125,7 @@ class PlaceErrors:
         """(P + K, N, 3) by which points of view v move per unit of each parameter and smooth error, scanner frame."""
         scan = self.capture.scans[v]
         cosine = self.measurement.scan_views[v].cosine[index]
-        smooth = -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
+        smooth = -error_shapes(scan.points[index] - scan.eye, cosine, self.half).vectors
         return smooth if self.slopes is None else np.concatenate([self.slopes.at(v, self.poses[v], index), smooth])
 
     def scan_modes(self, v: int, index: Indices) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from stitch.numerics.distributions import tukey
 from stitch.numerics.frames import Array, Indices
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import RMS_GATE
-from stitch.observations.surfaces.scanner_errors import SHARE_SPREAD, USUAL_SHARE, smooth_corrections
+from stitch.observations.surfaces.scanner_errors import SHARE_SPREAD, USUAL_SHARE, error_shapes
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums
 from stitch.session.measurement import Measurement
 
@@ -182,8 +182,8 @@ def _pair_samples(
             away = scan.points[index] - scan.eye
             cosine = measurement.scan_views[view].cosine[index]
             pose = unconstrained.poses[view]
-            undone = np.tensordot(shared, smooth_corrections(away, cosine, half), axes=1)
-            distances -= sign * np.einsum("ni,ni->n", undone, frames.rotate(frames.inverse(pose), m.normal))
+            normal = frames.rotate(frames.inverse(pose), m.normal)
+            distances -= sign * error_shapes(away, cosine, half).along_normals(normal) @ shared
             sides.append((_means(away, cell), _means(_cosines(away, m.normal, pose), cell)))
         share = np.sqrt(count / count.mean())
         rows = _means(frames.plane_rows(m.middle - g.centre, m.normal), cell)
