@@ -107,7 +107,7 @@ def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[s
     pairs = [(scored, again) for scored, again in zip(given, refitted, strict=True) if again.fitted]
     if not pairs:
         return {}
-    effects = [_fit_effect(fitted, again) for _, again in pairs]
+    effects = [_fit_effect(fitted, scored, again) for scored, again in pairs]
     if moves_points([effects[0].term]):
         return _trends_of_points(fitted, effects, [again for _, again in pairs])
     plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_axes(fitted, effects[0]))
@@ -140,7 +140,7 @@ def expected_in_view(
     anew = score(fitted, rivals[0].candidate)
     if surfaces is None or not anew.fitted or moves_points([scored.form.term for scored in rivals]):
         return None
-    effect = _fit_effect(fitted, anew)
+    effect = _fit_effect(fitted, rivals[0], anew)
     motion, (follows, _, _) = _axes(fitted, effect)
     if "gravity" in follows:
         return None
@@ -375,11 +375,17 @@ class _Effect:
     change: _Change
 
 
-def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
-    """Return the best form of a scored effect, fitted to a linear model; its covariance is at the score's variances."""
-    beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
-    change = _change(linear, scored.form.columns, beside)
-    return _Effect(scored.form.at(change.values), scored.form, change)
+def _fit_effect(linear: LinearModel, scored: Score, in_linear: Score) -> _Effect:
+    """Return an effect with form and values of its score, as they are stated; their covariance is that in `linear`.
+
+    Args:
+        in_linear: the score of the same candidate in `linear`.
+    """
+    beside = (
+        linear if in_linear.variances is None else replace(linear, null=at_variances(linear.mixed, in_linear.variances))
+    )
+    change = replace(_change(linear, scored.form.columns, beside), values=scored.values)
+    return _Effect(scored.form.at(scored.values), scored.form, change)
 
 
 def _axes(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
