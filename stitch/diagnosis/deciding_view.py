@@ -54,14 +54,15 @@ from stitch.observations.targets.rows import TargetRows
 from stitch.session.capture import build_capture
 from stitch.session.measurement import Measurement
 from stitch.session.robot import forward
+from stitch.system.threads import remembered
 
 # Poses that are tried; then the best of them again, with so many poses close to those.
 _TRIED, _BEST, _CLOSE_TO_BEST = 72, 3, 24
 # Times at the most that random poses are drawn, until there are enough to try.
 _SEARCHES = 6
-# Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, the least
-# cosine at which a surface is seen, and by which share of its size the field of the scans is widened.
-_POINTS, _LEAST_SEEN, _FACING, _MARGIN = 300, 0.5, 0.2, 0.1
+# Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, and the least
+# cosine at which a surface is seen.
+_POINTS, _LEAST_SEEN, _FACING = 300, 0.5, 0.2
 # Views that are proposed at the most, and the odds at which one more is not needed.
 MOST_VIEWS, SURE = 3, 0.95
 # A view that adds less than this to the probability that the true one is named is not worth driving to.
@@ -351,7 +352,7 @@ def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
 def seen_shares(observation: SurfaceObservation, scan_poses: Array, poses: Array) -> Array:
     """Return (K,) the share of the scanned surface that faces the scanner, within its field, at poses (K, 4, 4).
 
-    The field is the common box of all scans, scanner frame. About `_POINTS` points of the scans stand for the surface.
+    About `_POINTS` points of the scans stand for the surface.
 
     Args:
         scan_poses: T_reference_scanner (V, 4, 4) of the scans.
@@ -363,14 +364,28 @@ def seen_shares(observation: SurfaceObservation, scan_poses: Array, poses: Array
     posed = list(zip(scan_poses, scans, sampled, strict=True))
     points = np.concatenate([frames.transform(T, scan.points[i]) for T, scan, i in posed])
     normals = np.concatenate([scan.normals[i] @ T[:3, :3].T for T, scan, i in posed])
-    boxes = np.array([scan.box for scan in scans])
-    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-    in_scanner = frames.transform(frames.inverse(poses), points)
-    to_eye = scans[0].eye - in_scanner
-    facing = np.einsum("kmi,kmi->km", normals @ poses[:, :3, :3], to_eye) > _FACING * np.linalg.norm(to_eye, axis=2)
-    in_field = (in_scanner > low).all(axis=2) & (in_scanner < high).all(axis=2)
+    away = frames.transform(frames.inverse(poses), points) - scans[0].eye
+    facing = np.einsum("kmi,kmi->km", normals @ poses[:, :3, :3], -away) > _FACING * np.linalg.norm(away, axis=2)
+    low, high = _scanned_field(observation)
+    places = _field_places(away)
+    in_field = (places > low).all(axis=2) & (places < high).all(axis=2)
     return np.asarray((facing & in_field).mean(axis=1))
+
+
+@remembered
+def _scanned_field(observation: SurfaceObservation) -> tuple[Array, Array]:
+    """Return the least and the largest places in the scanner's field (3,), (3,) of all scans.
+
+    A box of places is a frustum: near the scanner the field is narrower than far away.
+    """
+    places = [_field_places(scan.points - scan.eye) for scan in observation.capture.scans]
+    return np.min([p.min(axis=0) for p in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
+
+
+def _field_places(away: Array) -> Array:
+    """Return x/z, y/z and z (…, 3) of vectors (…, 3) from the scanner's eye, scanner frame."""
+    z = away[..., 2:]
+    return np.concatenate([away[..., :2] / np.where(z == 0, 1e-300, z), z], axis=-1)
 
 
 def _waits(linear: LinearModel, scores: Sequence[Score | JointEffect], count: int) -> Array:

@@ -288,6 +288,21 @@ def test_a_further_view_where_one_stood_is_expected_about_where_that_one_is_pred
     assert min(view.expected["gear_harmonic"][1] for view in views) > 0 and min(view.sigma for view in views) > 0
 
 
+def test_a_part_in_a_near_corner_of_the_box_of_all_scans_is_not_in_the_field(cells: list[FreedBlade]):
+    """The field is a frustum: as far to the side as in the far scans, but as near as the nearest, nothing is seen."""
+    linear = cells[0].seen(_with_gear(cells[0])[0])
+    surfaces = surfaces_of(linear)
+    assert surfaces is not None
+    capture, poses = surfaces.capture, surfaces.capture.poses(linear.model.T_mount)
+    boxes = np.array([scan.box for scan in capture.scans])
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    corner = [0.9 * high[0], (low[1] + high[1]) / 2, low[2] + 0.1 * (high[2] - low[2])]
+    middle = capture.scans[0].points.mean(axis=0)
+    moved = poses[0] @ frames.make(np.eye(3), middle - corner)
+    at_scan, at_corner = deciding_view.seen_shares(surfaces, poses, np.array([poses[0], moved]))
+    assert at_corner < 0.5 * at_scan
+
+
 def test_a_slip_is_a_step_of_its_size_in_the_order_of_views(cells: list[FreedBlade]):
     """The part is on the flange: it sits elsewhere from view 8 on, where the scanner of the first views was."""
     plan = cells[0].measured.plan
