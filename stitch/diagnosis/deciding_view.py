@@ -60,8 +60,8 @@ from stitch.system.threads import remembered
 _TRIED, _BEST, _CLOSE_TO_BEST = 72, 3, 24
 # Times at the most that random poses are drawn, until there are enough to try.
 _SEARCHES = 6
-# Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, and the least
-# cosine at which a surface is seen.
+# Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, and the
+# least cosine at which a surface is seen.
 _POINTS, _LEAST_SEEN, _FACING = 300, 0.5, 0.2
 # Views that are proposed at the most, and the odds at which one more is not needed.
 MOST_VIEWS, SURE = 3, 0.95
