@@ -28,7 +28,7 @@ from stitch.cli.main import main as stitch
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.cells.cad import Box, CadSurface, Regions, cad_surface
-from stitch.plugins.cells.job_files import poses_from_columns, read_columns
+from stitch.plugins.cells.job_files import POSE_COLUMNS, poses_from_columns, read_columns
 from stitch.plugins.cells.placed_scans import JoinedScans, join_scans
 from stitch.plugins.cells.scan_to_cad import CadFit, find_cad_start, fit_cad
 from stitch.plugins.cells.seam import Limits, Station, measure_seam
@@ -219,8 +219,12 @@ def hand_eye_and_fits(folder: Path, line: WindowLine) -> None:
 
 def place_window(folder: Path, line: WindowLine) -> None:
     """Grip and place by the corrected paths."""
-    paths = [folder / f"found-{part}" / "path.csv" for part in ("window", "body")]
-    line.place(*(poses_from_columns(read_columns(path, "name", "x y z a_deg b_deg c_deg"))[-1] for path in paths))
+    line.place(path_end(folder, "window"), path_end(folder, "body"))
+
+
+def path_end(folder: Path, part: str) -> Array:
+    """Return the last pose (4, 4) of the path that was corrected for a part."""
+    return poses_from_columns(read_columns(folder / f"found-{part}" / "path.csv", "name", POSE_COLUMNS))[-1]
 
 
 def _command(*arguments: object) -> None:
@@ -294,8 +298,8 @@ def line_summary(rows: list[Row]) -> list[str]:
     ]
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt((values**2).mean()))
+def _rms(values: Array, axis: int | None = None) -> Array:
+    return np.sqrt((values**2).mean(axis=axis))
 
 
 def bond_trial(job: Row) -> Row:
@@ -327,14 +331,10 @@ def bond_summary(rows: list[Row]) -> list[str]:
     """One row for each of what is said."""
     true, said, sigma = (np.array([row[key] for row in rows]).reshape(-1, 3) for key in ("true", "said", "sigma"))
     off = said - true
-    columns = np.column_stack([true.min(axis=0), true.max(axis=0), *(_rms_of(v) for v in (off, sigma, off / sigma))])
+    columns = np.column_stack([true.min(axis=0), true.max(axis=0), *(_rms(v, 0) for v in (off, sigma, off / sigma))])
     lines = [(name, *(f"{v:.3f}" for v in line)) for name, line in zip(_PLACED, columns, strict=True)]
     title = f"Said before placing against what then was, {len(rows)} lines, eight places each; mm."
     return [title, "", *markdown("what | from | to | error, rms | sigma, rms | error over sigma, rms", lines)]
-
-
-def _rms_of(values: Array) -> Array:
-    return np.sqrt((values**2).mean(axis=0))
 
 
 BOND = Table(

@@ -11,6 +11,7 @@ import pytest
 
 import stitch
 from stitch.cli.main import main
+from tests.command_line import ended
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +214,5 @@ def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
     assert (tmp_path / "run" / "result.json").is_file()
 
 
-def test_the_number_of_views_is_stated_with_follow_alone(cell_folder, capfd):
-    with pytest.raises(SystemExit) as end:
-        main(["run", str(cell_folder), "--views", "3"])
-    assert end.value.code == 2 and "add --follow" in capfd.readouterr().err
+def test_the_number_of_views_is_stated_with_follow_alone(cell_folder):
+    assert "add --follow" in ended("run", cell_folder, "--views", 3, code=2).err

@@ -22,7 +22,7 @@ from data_synth.fixtures.labelled_arm import (
 )
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.write import write_session
-from stitch.cli.main import build, main
+from stitch.cli.main import build
 from stitch.system.files import rewrite_folder, whole_file
 from tests.command_line import ended
 
@@ -261,34 +261,33 @@ def in_metres(session, tmp_path):
     return folder
 
 
-def deep(capsys, *folders):
-    with pytest.raises(SystemExit) as end:
-        main(["check", "--deep", *map(str, folders), "--json"])
-    printed = capsys.readouterr()
-    return end.value.code or 0, json.loads(printed.out), printed.err
+def deep(*folders):
+    """What check --deep says of sessions of which one at least cannot be right."""
+    told = ended("check", "--deep", *folders, "--json", code=2)
+    return json.loads(told.out), told.err
 
 
-def test_a_unit_that_cannot_be_is_a_problem_as_any_other(in_metres, capsys):
-    code, told, _ = deep(capsys, in_metres)
-    assert code == 2 and told["ok"] is False
+def test_a_unit_that_cannot_be_is_a_problem_as_any_other(in_metres):
+    told, _ = deep(in_metres)
+    assert told["ok"] is False
     (problem,) = told["problems"]
     assert problem["kind"] == "unit" and problem["kind"] in KINDS and problem["views"] == []
     assert "cloud_unit" in problem["fix"] and "\n" not in problem["fix"]
 
 
-def test_one_cloud_in_another_unit_is_named(session, tmp_path, capsys):
+def test_one_cloud_in_another_unit_is_named(session, tmp_path):
     folder = shutil.copytree(session, tmp_path / "one")
     cloud = sorted((folder / "clouds").iterdir())[1]
     cloud.write_text("".join(f"{x} {y} 400000\n" for x in range(0, 90000, 3000) for y in range(0, 90000, 3000)))
     views = folder / "views.csv"
     cloud = cloud.rename(cloud.with_suffix(".xyz"))
     views.write_text(views.read_text(encoding="utf-8").replace(f"{cloud.stem}.ply", cloud.name), encoding="utf-8")
-    code, told, _ = deep(capsys, folder)
-    assert code == 2 and [(p["kind"], p["views"]) for p in told["problems"]] == [("unit", [cloud.stem])]
+    told, _ = deep(folder)
+    assert [(p["kind"], p["views"]) for p in told["problems"]] == [("unit", [cloud.stem])]
 
 
-def test_a_session_that_cannot_be_read_hides_no_other(in_metres, tmp_path, capsys):
-    code, told, err = deep(capsys, tmp_path / "nowhere", in_metres)
-    assert code == 2 and [row["ok"] for row in told] == [False, False]
+def test_a_session_that_cannot_be_read_hides_no_other(in_metres, tmp_path):
+    told, err = deep(tmp_path / "nowhere", in_metres)
+    assert [row["ok"] for row in told] == [False, False]
     assert told[0]["problems"] == [] and "not found" in told[0]["errors"][0] and "not found" in err
     assert told[1]["problems"][0]["kind"] == "unit"

@@ -11,14 +11,13 @@ import pytest
 from data_synth import commands, made_session, nature, scene, write
 from data_synth import demo as told
 from data_synth.commands import synth
-from data_synth.fixtures.edits import edit
+from data_synth.fixtures.edits import edit, replace_text
 from data_synth.fixtures.quiet_scenes import clean
 from data_synth.judgement import judge
 from data_synth.made_session import hidden_of, make, truth_path
 from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.cli import change, diagnose, run, terminal
-from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.session.reading.session_folder import load_session
 from tests.command_line import ended
@@ -78,9 +77,7 @@ def test_unknown_scene_names_those_there_are():
     ],
 )  # fmt: skip
 def test_mistakes_in_a_scene_are_named(small, old, new, says):
-    text = small.read_text()
-    assert old in text
-    small.write_text(text.replace(old, new, 1))
+    replace_text(small, old, new)
     with pytest.raises(InputError, match=says):
         make(small, {}, 0)
 
@@ -244,11 +241,9 @@ def test_reveal_prints_json_alone(tmp_path):
     assert json.loads(told.out)["judgement"] == "right"
 
 
-def test_people_read_what_was_hidden_once_and_with_units(tmp_path, capsys):
+def test_people_read_what_was_hidden_once_and_with_units(tmp_path):
     judged(tmp_path, fitted=FITTED, diagnosis={**NAMED, "verdict": "adequate", "effects": []})
-    with pytest.raises(SystemExit):
-        main(["reveal", str(tmp_path / "run"), str(tmp_path / "truth.json")])
-    told = capsys.readouterr().out.split("\n")
+    told = ended("reveal", tmp_path / "run", tmp_path / "truth.json").out.split("\n")
     assert [line.split() for line in told[:3]] == [
         ["hidden", "joint_compliance"],
         ["in", "the", "model", "joint_compliance"],

@@ -18,25 +18,13 @@ from data_synth.simulate import simulate
 from stitch.cli.main import main
 from stitch.numerics import frames
 from stitch.plugins.cells.base_to_base import read_stand, solve_stand
+from tests.command_line import ended
 
 
-def run(*arguments):
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in arguments])
-    return stop.value.code or 0
-
-
-def made(tmp_path, cell, capsys, *command):
-    """Truth of a cell, and what its command prints as JSON."""
-    assert run("synth", cell, tmp_path / "cell", "--seed", 3) == 0
-    assert "Next: stitch" in capsys.readouterr().err
-    assert run(*(str(part).replace("FOLDER", str(tmp_path / "cell")) for part in command)) == 0
+def test_drilling_finds_distortion_and_plate(tmp_path):
+    assert "Next: stitch" in ended("synth", "drilling", tmp_path / "cell", "--seed", 3).err
     truth = json.loads((tmp_path / "cell.truth.json").read_text())
-    return truth, json.loads(capsys.readouterr().out)
-
-
-def test_drilling_finds_distortion_and_plate(tmp_path, capsys):
-    truth, found = made(tmp_path, "drilling", capsys, "drill", "FOLDER/job.toml", "--json")
+    found = json.loads(ended("drill", tmp_path / "cell" / "job.toml", "--json").out)
     for effect in found["camera_effects"]:
         assert effect["accepted"]
         assert abs(effect["value"] - truth["hidden"][effect["effect"]]) < 4 * effect["sigma"]
@@ -65,7 +53,7 @@ def test_another_day_shares_arm_and_hand_eye(small):
     assert not np.allclose(first.covariates["humidity_percent"], second.covariates["humidity_percent"])
 
 
-def test_cells_are_whole_or_not_there(tmp_path, monkeypatch, capsys):
+def test_cells_are_whole_or_not_there(tmp_path, monkeypatch):
     def fails(folder, seed):
         (folder / "half.csv").write_text("x")
         raise OSError(28, "No space left on device")
@@ -76,9 +64,9 @@ def test_cells_are_whole_or_not_there(tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_cells_have_their_own_errors(tmp_path, capsys):
-    assert run("synth", "two-bases", tmp_path / "cell", "--hide", "backlash") == 2
-    assert "leave out --hide" in capsys.readouterr().err
+def test_cells_have_their_own_errors(tmp_path):
+    told = ended("synth", "two-bases", tmp_path / "cell", "--hide", "backlash", code=2)
+    assert "leave out --hide" in told.err
     assert not (tmp_path / "cell").exists()
 
 
@@ -98,8 +86,7 @@ def test_picture_shows_right_and_up(tmp_path):
 
 def test_picture_draws_scanners(tmp_path):
     box = trimesh.creation.box((10, 10, 10))
-    looking = np.eye(4)
-    looking[:3, 3] = [0, 0, -60]
+    looking = frames.make(np.eye(3), np.array([0, 0, -60]))
     plain = np.asarray(Image.open(render(box, tmp_path / "a.png", size=(160, 120)))).astype(int)
     with_scanner = render(box, tmp_path / "b.png", size=(160, 120), T_part_scanner=looking[None])
     pixels = np.asarray(Image.open(with_scanner)).astype(int)

@@ -7,8 +7,8 @@ import pytest
 
 import stitch
 from data_synth.cells.scanner_cell import scanner_cell, write_scanners
-from stitch.cli.main import main
 from stitch.numerics import frames
+from tests.command_line import ended
 
 CELL = scanner_cell("stands", 22, {"field_curvature": (1, 2.0)}, views=8, rays=60)
 
@@ -21,12 +21,6 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def better(run):
     return stitch.add(run, "field_curvature@right")
-
-
-def exit_code(call):
-    with pytest.raises(SystemExit) as ended:
-        main([*map(str, call)])
-    return ended.value.code
 
 
 def test_one_scanners_own_effect_is_named_for_that_one(run):
@@ -62,13 +56,12 @@ def test_a_saved_run_holds_a_folder_a_scanner_and_reads_back_the_same(better, tm
     assert again.scanners[1].U_alone == pytest.approx(better.scanners[1].U_alone)
 
 
-def test_a_saved_run_gives_the_hand_eye_of_the_scanner_that_is_named_and_asks_where_none_is(better, tmp_path, capsys):
+def test_a_saved_run_gives_the_hand_eye_of_the_scanner_that_is_named_and_asks_where_none_is(better, tmp_path):
     folder = better.save(tmp_path / "run", recording=False)
-    for call in (["export", folder, "--to", "opencv"], ["export", folder, "--to", "opencv", "--scanner", "top"]):
-        assert exit_code(call) == 2
-        assert "--scanner left or right" in capsys.readouterr().err
+    for stated in ([], ["--scanner", "top"]):
+        assert "--scanner left or right" in ended("export", folder, "--to", "opencv", *stated, code=2).err
     for name in ("left", "right"):
-        assert exit_code(["export", folder, "--to", "opencv", "--scanner", name, "-o", tmp_path / name]) == 0
+        ended("export", folder, "--to", "opencv", "--scanner", name, "-o", tmp_path / name)
         text = (tmp_path / name).read_text()
         assert text == stitch.export_run(better, "opencv", scanner=name)
         T = text.split("data: [")[1].split("]")[0]
@@ -76,9 +69,9 @@ def test_a_saved_run_gives_the_hand_eye_of_the_scanner_that_is_named_and_asks_wh
         assert np.allclose(np.fromstring(T, sep=",").reshape(4, 4), place.T_mount)
 
 
-def test_the_folder_of_one_scanner_has_no_page_and_says_where_it_is(better, tmp_path, capsys):
+def test_the_folder_of_one_scanner_has_no_page_and_says_where_it_is(better, tmp_path):
     folder = better.save(tmp_path / "run", recording=False)
-    assert exit_code(["report", folder / "cell-left"]) == 2
-    assert f"to fix: name {folder}" in " ".join(capsys.readouterr().err.split())
-    assert exit_code(["run", better.session.parts[0].path, "--hand-eye", folder, "-o", tmp_path / "again"]) == 2
-    assert "--hand-eye RUN/SESSION" in " ".join(capsys.readouterr().err.split())
+    assert f"to fix: name {folder}" in " ".join(ended("report", folder / "cell-left", code=2).err.split())
+    given = ("--hand-eye", folder, "-o", tmp_path / "again")
+    told = ended("run", better.session.parts[0].path, *given, code=2).err
+    assert "--hand-eye RUN/SESSION" in " ".join(told.split())

@@ -1,6 +1,7 @@
 """Base to base: the source's printed readings, closed forms, and noise; truth is built here, not by the package."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.fixtures.edits import replace_text
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells.base_to_base import read_stand, solve_stand
@@ -76,7 +78,7 @@ def test_experiment_2_as_printed_is_refused_with_the_size():
     assert found.sigmas == pytest.approx(abs(found.difference) / found.sigma)
 
 
-def general(seed, points, settings, noise=0.0):
+def general(seed, points=3, settings=5):
     """A tilted second base and stand with many points, all readings made from the truth; returns T, stand."""
     rng = np.random.default_rng(seed)
     up = Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)])
@@ -88,17 +90,15 @@ def general(seed, points, settings, noise=0.0):
     slide = np.linspace(3, 5, settings)
     theta, length = rng.uniform(0.4, 1.2, settings), rng.uniform(3, 5, settings)
     cups = zero + slide[:, None] * x + length[:, None] * (-np.cos(theta)[:, None] * x + np.sin(theta)[:, None] * y)
-    rail = zero + along[:, None] * x + rng.normal(0, noise, (points, 3))
-    rod = tilt.inv().apply(cups - t) + rng.normal(0, noise, (settings, 3))
-    angles, lengths = (values + rng.normal(0, noise, settings) for values in (theta, length))
-    s = stand(rail, rod, 0.0, angles, lengths, rail_slide=along)
+    rail = zero + along[:, None] * x
+    s = stand(rail, tilt.inv().apply(cups - t), 0.0, theta, length, rail_slide=along)
     s = replace(s, slide=slide, sigma_level_base=None)
     return tilt.as_matrix(), t, s
 
 
 def test_many_points_without_a_level_of_the_second_base():
     for seed in range(10):
-        R, t, s = general(seed, points=3, settings=5)
+        R, t, s = general(seed)
         found = fit_stand(s)
         assert np.abs(found.T_base1_base2[:3, :3] - R).max() < 1e-7
         assert np.abs(found.T_base1_base2[:3, 3] - t).max() < 1e-7
@@ -111,7 +111,7 @@ def test_covariance_is_the_scatter_of_repeated_measurements():
     """200 draws: a variance is known to ±√(2/200) = 10 %; five of those on the mean of all six is far below 30 %."""
     scaled = []
     for draw in range(200):
-        R, t, s = general(3, points=3, settings=5)
+        R, t, s = general(3)
         rng = np.random.default_rng(draw)
         rail = replace(s.rail, points=s.rail.points + rng.normal(0, 1e-4, (3, 3)))
         rod = replace(s.rod, points=s.rod.points + rng.normal(0, 1e-4, (5, 3)))
@@ -156,10 +156,8 @@ def errors():
     for _ in range(DRAWS):
         u = 0.5e-3 * (rng.random((3, 2)) - 0.5)
         lift = u[2] * np.pi / 2
-        P, R = (
-            exact_P * np.exp(1j * np.array([0.6283, -0.6283]) * u[0]),
-            exact_R * np.exp(1j * np.array([-0.4488, 0.4488]) * u[1]),
-        )
+        P = exact_P * np.exp(1j * np.array([0.6283, -0.6283]) * u[0])
+        R = exact_R * np.exp(1j * np.array([-0.4488, 0.4488]) * u[1])
         rail = [[z.real, z.imag, 1.3 + h] for z, h in zip(P, 0.8 * lift, strict=True)]
         rod = [[z.real, z.imag, 0.3] for z in R]
         s = stand(rail, rod, 3.8822, np.arctan2(arm.real, arm.imag), np.abs(arm), sigma=1e-4)
@@ -195,9 +193,8 @@ def test_command_refuses_with_exit_code_1(tmp_path):
     for old, new in (*second.items(), ("3.8822", "5.9093"), ("0.4488", "0.6283")):
         text = text.replace(old, new)
     (tmp_path / "two.toml").write_text(text, encoding="utf-8")
-    told = ended("base", tmp_path / "two.toml", code=1)
+    message = ended("base", tmp_path / "two.toml", code=1).err
     by_rod = np.sqrt(25 + 5.5555**2 - 2 * 5 * 5.5555 * np.cos(1.1772 - 1.1305))
-    message = told.err
     assert "contradict" in message and f"{1.4 * np.sin(0.6283) - by_rod:+.4f} m" in message
 
 
@@ -218,9 +215,8 @@ def test_command_refuses_with_exit_code_1(tmp_path):
     ],
 )
 def test_bad_input_is_named(tmp_path, old, new, part):
-    text = EXAMPLE.read_text(encoding="utf-8")
-    assert old in text
-    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    shutil.copyfile(EXAMPLE, tmp_path / "bad.toml")
+    replace_text(tmp_path / "bad.toml", old, new)
     with pytest.raises(InputError) as error:
         read_stand(tmp_path / "bad.toml")
     assert part in str(error.value) and str(tmp_path / "bad.toml") in str(error.value)
@@ -385,9 +381,8 @@ def test_scara_by_its_closed_form():
     ],
 )
 def test_wrong_joints_are_named(tmp_path, old, new, message):
-    text = JOINTS_EXAMPLE.read_text()
-    assert old in text
-    (tmp_path / "stand.toml").write_text(text.replace(old, new))
+    shutil.copyfile(JOINTS_EXAMPLE, tmp_path / "stand.toml")
+    replace_text(tmp_path / "stand.toml", old, new)
     with pytest.raises(InputError) as error:
         read_stand(tmp_path / "stand.toml")
     assert message in str(error.value)

@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.drilling import calibrated_sensors, run_group
 from data_synth.cells.drilling import FOCAL, GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import ellipse_centres, render_holes, render_plate
 from data_synth.cells.drilling_job import write_job, write_locating, write_trials
-from stitch.cli.main import main
+from data_synth.fixtures.edits import replace_text
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells import drilling_sensors
 from stitch.plugins.cells.drill_job import read_drill_job
-from stitch.plugins.cells.drill_servo import align_tool_axis, drive_pose, servo_to_hole, turn_upright
+from stitch.plugins.cells.drill_servo import align_tool_axis, drive_pose, servo_to_hole
 from stitch.plugins.cells.drilling import solve_drill_job
 from stitch.plugins.cells.drilling_sensors import (
     FlangeSensors,
@@ -283,27 +284,12 @@ def test_too_few_holes_in_the_image():
 def experiment(seed):
     """True errors (8, 2) in mm and deg of the holes to drill, before and after: servo, compensate, turn upright."""
     cell = DrillingCell(seed)
-    xyz, uv = cell.plate()
-    planes, readings = cell.plane_readings()
-    beams = {f"L{i + 1}": fit_ranger(planes, row) for i, row in enumerate(readings)}
-    sensors = FlangeSensors(fit_homography(xyz[:, :2], uv), beams, HEIGHT)
-
-    def looker(name):
-        return lambda T_base_tool: sensors.see(*cell.measure(name, T_base_tool))
-
+    sensors, *_ = calibrated_sensors(cell)
     before, after = [], []
     for references, targets in GROUPS.values():
         before += [cell.errors(name, drive_pose(*cell.nominal[name])) for name in targets]
-        actual = []
-        for name in references:
-            T_base_tool, sight, _ = servo_to_hole(looker(name), drive_pose(*cell.nominal[name]))
-            actual.append(sight.hole(T_base_tool))
-        compensation = compensate_group(np.array([cell.nominal[name][0] for name in references]), np.array(actual))
-        positions, directions = (np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1))
-        T = compensation.T_actual_nominal
-        placed = frames.transform(T, positions), frames.rotate(T, directions)
-        for name, position, direction in zip(targets, *placed, strict=True):
-            after.append(cell.errors(name, turn_upright(looker(name), drive_pose(position, direction))))
+        drives = run_group(cell, sensors, references, targets).drives
+        after += [cell.errors(name, drives[name]) for name in targets]
     return np.array(before), np.array(after)
 
 
@@ -453,9 +439,7 @@ def test_effects_left_out_leave_the_reference_holes_wrong(tmp_path):
 )
 def test_bad_input_is_named(tmp_path, file, old, new, part):
     write_job(tmp_path, DrillingCell(0))
-    text = (tmp_path / file).read_text(encoding="utf-8")
-    assert old in text
-    (tmp_path / file).write_text(text.replace(old, new, 1), encoding="utf-8")
+    replace_text(tmp_path / file, old, new)
     with pytest.raises(InputError) as error:
         read_drill_job(tmp_path / "job.toml")
     assert part in str(error.value) and str(tmp_path) in str(error.value)
@@ -568,24 +552,21 @@ def driven_job(tmp_path):
         server.shutdown()
 
 
-def drive(folder, address, unreachable="", *arguments):
+def drive(folder, address, *arguments, unreachable="", code=0):
     program = MACHINE.format(unreachable=unreachable, address=address)
     (folder / "machine.py").write_text(program, encoding="utf-8")
-    with pytest.raises(SystemExit) as stop:
-        main(["drill", str(folder / "job.toml"), "--servo", f"{sys.executable} {folder / 'machine.py'}", *arguments])
-    return stop.value.code
+    servo = f"{sys.executable} {folder / 'machine.py'}"
+    return ended("drill", folder / "job.toml", "--servo", servo, *arguments, code=code)
 
 
-def test_servo_drives_the_cell_to_the_published_errors(driven_job, capsys):
+def test_servo_drives_the_cell_to_the_published_errors(driven_job):
     """Cut short by a hole out of reach, the call keeps what it has; the next one goes on and ends upright on all holes."""
     folder, cell, address = driven_job
-    assert drive(folder, address, "105") == 1
-    message = capsys.readouterr().err
+    message = drive(folder, address, unreachable="105", code=1).err
     assert "hole 105" in message and "cannot reach" in message and "joint 5 ends at 118 deg" in message
     placed = (folder / "placed.csv").read_text(encoding="utf-8").splitlines()
     assert [line.split(",")[0] for line in placed] == ["hole", "101", "102"]
-    assert drive(folder, address, "", "-o", str(folder / "drives.csv"), "--json") == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(drive(folder, address, "-o", folder / "drives.csv", "--json").out)
     assert (folder / "placed.csv").read_text(encoding="utf-8").startswith("\n".join(placed))
     rows = np.genfromtxt(folder / "drives.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     assert len(rows) == 4 == sum(trial["stage"] == "levelled" for trial in document["trials"])

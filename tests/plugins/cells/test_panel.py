@@ -4,26 +4,25 @@ import json
 import math
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.panel import LAYOUT, LEGS, pose_error, read, ready, run_pose, run_shape
 from data_synth.cells import hexapod, panel_job
-from data_synth.cells.panel import NAMES, PanelCell, Sizes
+from data_synth.cells.panel import PanelCell, Sizes
+from data_synth.fixtures.edits import replace_text
 from data_synth.shell import Laminate, Shell
-from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells.panel import read_panel_job, solve_panel_job
 from stitch.plugins.cells.panel_model import (
-    SHAPE_AXES,
     ClampLayout,
     ControlPoints,
     LaserTracker,
-    Legs,
-    ReflectorReadings,
     RobotModel,
     adjust_pose,
     calibrate_robot,
@@ -31,7 +30,6 @@ from stitch.plugins.cells.panel_model import (
     errors_along_motion,
     find_leg_offset,
     follow,
-    largest_deviations,
     leg_jacobian,
     preposition,
     rigid_fit,
@@ -41,8 +39,6 @@ from stitch.plugins.cells.panel_model import (
 from tests.command_line import ended
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "panel"
-LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
-LEGS = Legs(hexapod.BASE, hexapod.PLATFORM)
 
 
 def pose(a, b, c, *t):
@@ -102,21 +98,11 @@ def test_rigid_fit_covariance_is_the_spread_of_draws():
         rigid_fit(np.outer(np.arange(4.0), [1, 2, 3]), np.outer(np.arange(4.0), [1, 2, 3]), np.ones(4))
 
 
-def measured(seed, poses=40, hidden=None, leg=0.0):
-    cell = PanelCell(seed, Sizes(leg=leg), np.zeros((6, 6)) if hidden is None else hidden)
-    tracker = LaserTracker(cell.tracker)
-    commands = panel_job.calibration_poses(poses, seed)
-    seen = panel_job.calibration(cell, commands)
-    return cell, [
-        ReflectorReadings(n, commands[:, i], seen[:, i], tracker.sigma(seen[:, i])) for i, n in enumerate(NAMES)
-    ]
-
-
 def test_global_model_is_within_its_sigmas():
     """Twelve unknowns of six robots: chi-square of 72, beyond 117 by a chance of 1e-3... and of the residuals too."""
-    cell, readings = measured(5)
+    cell = PanelCell(5, Sizes(leg=0.0))
     p = []
-    for i, reading in enumerate(readings):
+    for i, reading in enumerate(read(cell, LaserTracker(cell.tracker))):
         model = calibrate_robot(reading)
         off = frames.log(np.linalg.inv(cell.T_world_base[i]) @ model.T_world_base)
         assert off @ np.linalg.solve(model.covariance[:6, :6], off) < 27.9  # chi-square of 6, chance 1e-4
@@ -156,7 +142,8 @@ def test_joints_off_their_drawing_move_the_flange():
 def test_hidden_leg_offset_is_found_in_its_robot_only():
     hidden = np.zeros((6, 6))
     hidden[2, 3] = 0.5
-    _, readings = measured(11, hidden=hidden, leg=0.004)
+    cell = PanelCell(11, leg_offsets=hidden)
+    readings = read(cell, LaserTracker(cell.tracker))
     found = [find_leg_offset(r, calibrate_robot(r), LEGS, 36) for r in readings]
     assert [f.found for f in found] == [False, False, True, False, False, False]
     assert found[2].leg == 4
@@ -222,42 +209,19 @@ def test_plate_strip_bends_as_a_beam():
     assert sag[2] == pytest.approx(5 * load * 1000.0**4 / (384 * law.modulus * law.thickness**3 / 12), rel=0.01)
 
 
-def ready(seed):
-    cell, readings = measured(seed, leg=0.004)
-    models = [calibrate_robot(r) for r in readings]
-    base, contact = (np.array([getattr(m, n) for m in models]) for n in ("T_world_base", "T_flange_contact"))
-    start = preposition(base, cell.target, clamp_contacts(LAYOUT).T_panel_contact, contact)
-    cell.drive(start)
-    cell.lay()
-    return cell, models, start
-
-
 def test_pose_after_one_adjustment_and_shape_within_three_iterations():
     """The source's own limits: 0.08 mm, 0.008°, 0.6 mm; measured against the true places of the targets."""
-    cell, models, start = ready(2)
-    nominal, tracker = panel_job.pose_targets(), LaserTracker(cell.tracker)
-    places = cell.track(nominal)
-    bases = np.array([m.T_world_base for m in models])
-    stand = adjust_pose(bases, start, 1, rigid_fit(nominal, places, tracker.sigma(places)).T, cell.target)
-    cell.drive(stand)
-    true = rigid_fit(nominal, cell.true_points(nominal), np.ones(12)).T
-    off = frames.log(np.linalg.inv(cell.target) @ true)
-    assert np.abs(off[3:]).max() < 0.08
-    assert np.degrees(np.abs(off[:3])).max() < 0.008
+    r = ready(2)
+    cell = r.cell
+    stand = run_pose(cell, r.setup, panel_job.pose_targets(), r.T_base_flange)
+    turned, moved = np.split(np.abs(pose_error(cell)), 2)
+    assert moved.max() < 0.08 and turned.max() < 0.008
 
     cell.compliant = True
     control, clamp = panel_job.control_points()
     contact = clamp_contacts(LAYOUT).T_panel_contact
-    points = ControlPoints(control, clamp, contact)
-    deviations = []
-    while not deviations or (deviations[-1] > 0.6 and len(deviations) < 4):
-        seen = frames.transform(np.linalg.inv(cell.target), cell.track(control))
-        step = shape_step(seen, points, stand, np.array([m.T_flange_contact for m in models]), axes=SHAPE_AXES)
-        deviations.append(largest_deviations(step.deviations, points).max())
-        if deviations[-1] > 0.6:
-            stand = step.T_base_flange
-            cell.drive(stand)
-    assert deviations[0] > 3 and deviations[-1] <= 0.6
+    shaped = run_shape(cell, r.setup, ControlPoints(control, clamp, contact), stand, tolerance=0.6)
+    assert shaped.deviations[0].max() > 3 and len(shaped.deviations) <= 4
     world = np.linalg.inv(cell.target) @ np.vstack([cell.true_points(control).T, np.ones(18)])
     across = np.einsum("ki,ki->k", world[:3].T - control, contact[clamp][:, :3, 2])
     assert np.abs(across).max() < 0.6
@@ -295,15 +259,14 @@ def test_command_on_the_example(example):
     assert {f.name for f in folder.iterdir()} >= {"preposition.csv", "pose_move.csv", "shape_move.csv", "errors.png"}
 
 
-def test_tracker_readings_in_its_own_frame_give_the_same(example, tmp_path, stitch_command):
+def test_tracker_readings_in_its_own_frame_give_the_same(example, job, stitch_command):
     """Everything the tracker sees, turned into a frame of its own, with four reference points of the world."""
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    folder = job.parent
     T = np.linalg.inv(pose(25, 3, -2, -3200, -1800, 1900))
     seen = ["seen_x seen_y seen_z"]
     tables = {"targets": seen, "control": seen, "calibration": ["x1 y1 z1", "x2 y2 z2", "x3 y3 z3"]}
     for name, columns in tables.items():
-        lines = (tmp_path / f"{name}.csv").read_text().splitlines()
+        lines = (folder / f"{name}.csv").read_text().splitlines()
         header, rows = lines[0].split(","), [line.split(",") for line in lines[1:]]
         for triple in columns:
             at = [header.index(c) for c in triple.split()]
@@ -311,13 +274,12 @@ def test_tracker_readings_in_its_own_frame_give_the_same(example, tmp_path, stit
                 moved = T[:3, :3] @ [float(row[i]) for i in at] + T[:3, 3]
                 for i, value in zip(at, moved, strict=True):
                     row[i] = f"{value:.9f}"
-        (tmp_path / f"{name}.csv").write_text("\n".join([lines[0], *(",".join(r) for r in rows)]))
+        (folder / f"{name}.csv").write_text("\n".join([lines[0], *(",".join(r) for r in rows)]))
     world = np.array([[0, 0, 0], [4000.0, 0, 0], [0, 3000.0, 0], [0, 0, 2000.0]])
     rows = [f"W{i},{','.join(f'{v:.9f}' for v in [*p, *(T[:3, :3] @ p + T[:3, 3])])}" for i, p in enumerate(world)]
-    (tmp_path / "world.csv").write_text("\n".join(["point,x,y,z,seen_x,seen_y,seen_z", *rows]))
-    job = (tmp_path / "job.toml").read_text()
-    (tmp_path / "job.toml").write_text(job.replace("[files]", '[files]\nworld = "world.csv"'))
-    found = json.loads(stitch_command("panel", tmp_path / "job.toml", "--json"))
+    (folder / "world.csv").write_text("\n".join(["point,x,y,z,seen_x,seen_y,seen_z", *rows]))
+    replace_text(job, "[files]", '[files]\nworld = "world.csv"')
+    found = json.loads(stitch_command("panel", job, "--json"))
     assert found["pose"]["position_error"] == pytest.approx(example[0]["pose"]["position_error"], abs=1e-5)
 
 
@@ -333,11 +295,10 @@ def test_shape_of_the_example_is_judged_apart_from_its_pose(example):
     assert np.abs(found["pose"]["position_error"]).max() > 2
 
 
-def main_code(arguments):
-    try:
-        main(arguments)
-    except SystemExit as stop:
-        assert not stop.code
+@pytest.fixture
+def job(tmp_path):
+    """The job of examples, of one's own."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "job")) / "job.toml"
 
 
 @pytest.mark.parametrize(
@@ -350,15 +311,10 @@ def main_code(arguments):
         ('"flanges.csv"', '"none.csv"', "none.csv: not found"),
     ],
 )
-def test_bad_job_is_refused_in_one_line(tmp_path, old, new, message):
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    text = (EXAMPLE / "job.toml").read_text()
-    assert old in text
-    (tmp_path / "job.toml").write_text(text.replace(old, new))
-    error = ended("panel", tmp_path / "job.toml", code=2).err
-    assert message in error
-    assert error.count("\n") == 1
+def test_bad_job_is_refused_in_one_line(job, old, new, message):
+    replace_text(job, old, new)
+    error = ended("panel", job, code=2).err
+    assert message in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -373,12 +329,9 @@ def test_bad_job_is_refused_in_one_line(tmp_path, old, new, message):
         ("force_N = 3.0\ntorque_Nm = 3.0", None),
     ],
 )
-def test_forces_beyond_their_limit_stop_all_robots(tmp_path, limits, message):
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    job = (tmp_path / "job.toml").read_text()
-    (tmp_path / "job.toml").write_text(f"{job}\n[limits]\n{limits}\n")
-    read = read_panel_job(tmp_path / "job.toml")
+def test_forces_beyond_their_limit_stop_all_robots(job, limits, message):
+    job.write_text(f"{job.read_text()}\n[limits]\n{limits}\n")
+    read = read_panel_job(job)
     if message is None:
         assert (read.force_limit, read.torque_limit) == (3.0, 3.0)
         return
@@ -386,14 +339,11 @@ def test_forces_beyond_their_limit_stop_all_robots(tmp_path, limits, message):
         solve_panel_job(read)
 
 
-def test_limits_without_forces_are_refused(tmp_path):
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    job = (tmp_path / "job.toml").read_text()
-    lines = [line for line in job.splitlines() if not line.startswith("forces")]
-    (tmp_path / "job.toml").write_text("\n".join([*lines, "[limits]", "force_N = 5.0"]))
+def test_limits_without_forces_are_refused(job):
+    lines = [line for line in job.read_text().splitlines() if not line.startswith("forces")]
+    job.write_text("\n".join([*lines, "[limits]", "force_N = 5.0"]))
     with pytest.raises(InputError, match=r"\[limits\] goes with files\.forces; to fix"):
-        read_panel_job(tmp_path / "job.toml")
+        read_panel_job(job)
 
 
 # Stands for the machines: the panel is then exactly where its drawing puts it.
@@ -416,42 +366,32 @@ assert len(list(csv.DictReader(open(sys.argv[1])))) == 6
 
 
 @pytest.fixture
-def driven(tmp_path, monkeypatch):
-    shutil.copytree(EXAMPLE, tmp_path / "job")
-    monkeypatch.chdir(tmp_path / "job")
-    (tmp_path / "job" / "machine.py").write_text(OBEDIENT)
-
-    def call(program):
-        with pytest.raises(SystemExit) as stop:
-            main(["panel", "job.toml", "-o", "moves", "--json", "--drive", program])
-        return stop.value.code
-
-    return call
+def driven(job, monkeypatch):
+    monkeypatch.chdir(job.parent)
+    (job.parent / "machine.py").write_text(OBEDIENT)
+    return partial(ended, "panel", "job.toml", "-o", "moves", "--json", "--drive")
 
 
-def test_shape_is_corrected_until_it_is_within_the_tolerance(driven, capsys):
-    assert driven(f"{sys.executable} machine.py moves/shape_move.csv 0") == 0
-    before, after = json.loads(capsys.readouterr().out)["corrections"]["largest_deviation"]
+def test_shape_is_corrected_until_it_is_within_the_tolerance(driven):
+    told = driven(f"{sys.executable} machine.py moves/shape_move.csv 0")
+    before, after = json.loads(told.out)["corrections"]["largest_deviation"]
     assert before > 1.0 and after < 1e-6
 
 
-def test_a_machine_that_fails_ends_it(driven, capsys):
-    assert driven(f"{sys.executable} -c 1/0") == 1
-    said = " ".join(capsys.readouterr().err.split())
+def test_a_machine_that_fails_ends_it(driven):
+    said = " ".join(driven(f"{sys.executable} -c 1/0", code=1).err.split())
     assert "exit code 1, ZeroDivisionError: division by zero. The robots stand where it left them; to fix: " in said
 
 
 @pytest.mark.slow
-def test_a_panel_that_does_not_follow_ends_it(driven, capsys):
-    assert driven(f"{sys.executable} machine.py moves/shape_move.csv 1") == 1
-    said = " ".join(capsys.readouterr().err.split())
+def test_a_panel_that_does_not_follow_ends_it(driven):
+    said = " ".join(driven(f"{sys.executable} machine.py moves/shape_move.csv 1", code=1).err.split())
     assert "the shape is still" in said and "mm off after 10 corrections, 0.6 mm are allowed" in said
 
 
 @pytest.mark.slow
-def test_a_simulated_panel_gets_its_shape_by_one_command(tmp_path, monkeypatch, capsys):
+def test_a_simulated_panel_gets_its_shape_by_one_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    main_code(["synth", "panel-robots", "cell", "--seed", "3"])
+    ended("synth", "panel-robots", "cell", "--seed", 3)
     machine = f"{sys.executable} -m data_synth.cells.panel_job cell moves/shape_move.csv"
-    main_code(["panel", "cell/job.toml", "-o", "moves", "--drive", machine])
-    assert "Shape control: 1 correction, " in capsys.readou.out().err
+    assert "Shape control: 1 correction, " in ended("panel", "cell/job.toml", "-o", "moves", "--drive", machine).err

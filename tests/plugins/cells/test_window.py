@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,43 +13,28 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bench.window import NOISE, furthest, hand_eye_and_fits, joined, path_end, place_window
+from bench.window import turned as truth
 from data_synth.cells import window_scans, window_views
 from data_synth.cells.window_line import EXACT, Errors, WindowLine
-from data_synth.cells.window_line_job import write_line, write_seam
+from data_synth.cells.window_line_job import write_seam
+from data_synth.fixtures.edits import replace_text
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
-from stitch.plugins.cells.cad import Box, Regions, cad_surface, nearest_partners
+from stitch.plugins.cells.cad import Box, Regions, cad_surface, coverage, nearest_partners
 from stitch.plugins.cells.job_files import POSE_COLUMNS, poses_from_columns, read_columns, write_poses
-from stitch.plugins.cells.placed_scans import join_scans
 from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
 from stitch.plugins.cells.seam import Limits, Station, bond_gap, find_edge, measure_seam
-from stitch.plugins.cells.window import correct_path, read_seam_job, solve_seam
-from stitch.session.scan import prepare_scan
+from stitch.plugins.cells.window import correct_path, read_fit_job, read_seam_job, solve_seam
 from tests.command_line import ended
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "window"
-NOISE = 0.05
 # A door of half the size: the same shapes, a quarter of the triangles.
 DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
 # A bulge that is 3 mm deep in the body and not in its CAD.
 WELD = window_scans.Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
-
-
-def truth(seed):
-    return frames.make(Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), [3567.7, -2954.3, 1932.9])
-
-
-def joined(clouds, poses):
-    return join_scans([prepare_scan("", c) for c in clouds], poses)
-
-
-def furthest(T, true, mesh):
-    """The largest distance by which the pose's error moves a point of the part."""
-    off = (T - true) @ np.vstack([mesh.vertices.T, np.ones(len(mesh.vertices))])
-    return np.linalg.norm(off[:3], axis=0).max()
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +218,7 @@ def test_path_follows_the_part():
     assert np.allclose(np.linalg.inv(found) @ moved, np.linalg.inv(nominal) @ tool[0])
 
 
-def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it_is_lost(tmp_path, monkeypatch, capsys):
+def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it_is_lost(tmp_path, monkeypatch):
     """The scanner's poses are moved in place of the part: 3 mm and 2 mrad a step, then 300 mm at once."""
     columns = read_columns(EXAMPLE / "pane.csv", "file", POSE_COLUMNS)
     files = [str(EXAMPLE / name) for name in columns.texts["file"]]
@@ -244,9 +230,7 @@ def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it
     for table, T in zip(tables, moved, strict=True):
         write_poses(table, "file", files, T @ poses_from_columns(columns))
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{table}\n" for table in tables)))
-    with pytest.raises(SystemExit, match="0"):
-        main(["fit", str(EXAMPLE / "fit.toml"), "--follow"])
-    answers = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    answers = [json.loads(line) for line in ended("fit", EXAMPLE / "fit.toml", "--follow").out.splitlines()]
     first = np.array(answers[0]["T_base_part"])
     for answer, T in zip(answers[1:3], moved[1:3], strict=True):
         assert np.abs(np.array(answer["T_base_part"]) - T @ first)[:3, 3].max() < 0.01
@@ -268,19 +252,14 @@ def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it
     ],
 )
 def test_bad_job_is_refused_in_one_line(tmp_path, command, name, old, new, message):
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    text = (EXAMPLE / name).read_text()
-    assert old in text
-    (tmp_path / name).write_text(text.replace(old, new))
+    shutil.copytree(EXAMPLE, tmp_path, dirs_exist_ok=True)
+    replace_text(tmp_path / name, old, new)
     error = ended(command, tmp_path / name, code=2).err
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
 
 
 def test_how_far_two_scans_stand_apart_is_in_the_gap_and_little_in_the_flush(tmp_path):
-    for file in EXAMPLE.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    shutil.copytree(EXAMPLE, tmp_path, dirs_exist_ok=True)
     job = tmp_path / "seam.toml"
     alone = solve_seam(read_seam_job(job))
     job.write_text("pose_sigma = 0.1\n" + job.read_text())
@@ -292,13 +271,9 @@ def test_how_far_two_scans_stand_apart_is_in_the_gap_and_little_in_the_flush(tmp
 
 
 def test_expected_region_without_points_is_no_fit(pane_cad):
-    from stitch.plugins.cells.cad import coverage
-
     box = Box("corner", np.array([-1e3, -1e3, -1e3]), np.array([1e3, 1e3, 1e3]))
     assert coverage(box, pane_cad, np.array([[5e3, 0, 0.0]]), np.array([[0, 1.0, 0]])) == 0.0
     with pytest.raises(InputError, match="not found"):
-        from stitch.plugins.cells.window import read_fit_job
-
         read_fit_job("nowhere.toml")
 
 
@@ -308,24 +283,6 @@ def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
     thrown = replace(scan, points=points)
     with pytest.raises(NoResultError, match="correct a scanner's pose"):
         find_cad_start(thrown, pane_cad)
-
-
-def run(*arguments):
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as stop:
-        assert not stop.code
-
-
-def path_end(file):
-    """The last pose of a path: x, y, z and turns about z, y', x'' in degrees."""
-    row = list(csv.DictReader(file.open()))[-1]
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler(
-        "ZYX", [float(row[k]) for k in ("a_deg", "b_deg", "c_deg")], degrees=True
-    ).as_matrix()
-    T[:3, 3] = [float(row[k]) for k in "xyz"]
-    return T
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["area", "sweeps"])
@@ -341,14 +298,11 @@ def placed(tmp_path_factory, request):
     line = WindowLine(
         3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, edges=7, weld=WELD, sweeps=request.param
     )
-    write_line(folder, line)
     in_rack = line.T_cell_window
-    run("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
-    run("fit", folder / "window.toml", "-o", folder / "found-window")
-    run("fit", folder / "body.toml", "-o", folder / "found-body")
-    line.place(*(path_end(folder / f"found-{part}" / "path.csv") for part in ("window", "body")))
+    hand_eye_and_fits(folder, line)
+    place_window(folder, line)
     write_seam(folder, line)
-    run("seam", folder / "seam.toml", "-o", folder / "seam.csv")
+    ended("seam", folder / "seam.toml", "-o", folder / "seam.csv")
     return folder, line, in_rack
 
 
@@ -369,20 +323,11 @@ def test_programs_follow_the_parts_as_the_paths_do(placed):
     for part, name in (("window", "grip"), ("body", "place")):
         copy = folder / f"{name}-there.src"
         if not copy.exists():
-            run(
-                "export",
-                folder / f"found-{part}",
-                "--program",
-                folder / f"{name}.src",
-                "-o",
-                copy,
-                "--frame",
-                "0,0,0,0,0,0",
-            )
-        numbers = [float(x) for x in re.findall(r"[XYZABC] (-?[0-9.]+)", copy.read_text().splitlines()[-2])]
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = Rotation.from_euler("ZYX", numbers[3:], degrees=True).as_matrix(), numbers[:3]
-        assert np.abs(T - path_end(folder / f"found-{part}" / "path.csv")).max() < 2e-4
+            there = ("--program", folder / f"{name}.src", "-o", copy, "--frame", "0,0,0,0,0,0")
+            ended("export", folder / f"found-{part}", *there)
+        *place, a, b, c = map(float, re.findall(r"[XYZABC] (-?[0-9.]+)", copy.read_text().splitlines()[-2]))
+        T = frames.make(Rotation.from_euler("ZYX", [a, b, c], degrees=True).as_matrix(), np.array(place))
+        assert np.abs(T - path_end(folder, part)).max() < 2e-4
 
 
 @pytest.mark.slow
@@ -428,9 +373,7 @@ def test_seam_is_that_of_the_meshes(placed):
 @pytest.mark.slow
 def test_bad_scans_are_refused_in_one_line(placed, old, new, message):
     folder, _, _ = placed
-    text = (folder / "window.toml").read_text()
-    assert old in text
-    (folder / "bad.toml").write_text(text.replace(old, new))
+    shutil.copyfile(folder / "window.toml", folder / "bad.toml")
+    replace_text(folder / "bad.toml", old, new)
     error = ended("fit", folder / "bad.toml", code=2).err
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in error and error.count("\n") == 1

@@ -18,7 +18,6 @@ from data_synth.fixtures.robot_programs import SUFFIXES, program
 from data_synth.fixtures.run_folders import bare_run
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
-from stitch.cli.main import main
 from stitch.effects import EFFECTS
 from stitch.errors import InputError, NoResultError
 from stitch.model.model import Term
@@ -37,29 +36,34 @@ ARM = ARMS["KUKA KR30-3"]
 TABLE = robot_table(ARM)
 ROBOT = robot_from_dh("KR30-3", "standard", TABLE["joints"], None, np.array(TABLE["gravity"]), "mm")
 JOINTS = ARM.home + np.random.default_rng(5).uniform(-0.4, 0.4, (3, 6))
-TOOL = np.eye(4)
-TOOL[:3, :3], TOOL[:3, 3] = Rotation.from_euler("ZYX", [30, -20, 10], degrees=True).as_matrix(), [40, -25, 180]
-FRAME = np.eye(4)
-FRAME[:3, :3], FRAME[:3, 3] = Rotation.from_euler("z", 35, degrees=True).as_matrix(), [900, 200, 500]
+
+
+def pose(x, y, z, a, b, c):
+    """A frame of KUKA's numbers, mm and degrees."""
+    R = Rotation.from_euler("ZYX", [a, b, c], degrees=True)
+    return frames.make(R.as_matrix(), np.array([x, y, z]))
+
+
+TOOL, FRAME = pose(40, -25, 180, 30, -20, 10), pose(900, 200, 500, 35, 0, 0)
 # Reach of the arm with its tool, mm; a joint rounded by so much turns the tool by less than reach times it.
 REACH = 2500.0
 ZERO = {"kuka": "0,0,0,0,0,0", "fanuc": "0,0,0,0,0,0", "abb": "0,0,0,1,0,0,0", "ur": "0,0,0,0,0,0"}
 SAMPLES = [("a.ls", FANUC), ("a.dat", KUKA_DAT), ("a.mod", ABB), ("a.script", UR)]
 ROWS = [[-1.25, -68.5, 111.0, 69.125, 67.0, 6.5], [10.0, -70.0, 100.0, -30.0, 55.5, 170.25]]
-POSES = np.array(
-    [
-        frames.exp(np.array([0.3, -1.1, 0.4, 900.0, -120.5, 640.25])),
-        frames.exp(np.array([0, 0, 1.0, 1.0, 2.0, 3.0])),
-    ]
-)
+POSES = frames.exp(np.array([[0.3, -1.1, 0.4, 900.0, -120.5, 640.25], [0, 0, 1.0, 1.0, 2.0, 3.0]]))
 ABOUT = "Drives to the view that decides between gear_eccentricity and gear_harmonic."
 
 
-def arm_with(name, p, sigma=float("nan")):
+def at_zero(file):
+    """--frame and --tool of a program whose poses are those of the flange in the base."""
+    return [ZERO[{".ls": "fanuc", ".mod": "abb"}.get(file.suffix, "kuka")]] * 2
+
+
+def arm_with(name, p):
     """The arm with nature's own parameters of one effect; the rest as a session of it would have them."""
     effect = EFFECTS[name]
     own = effect.parameters(6, torques_of(ROBOT, JOINTS).names, "mm")
-    term = Term(effect, own).at(np.array([p.get(q.name, 0.0) for q in own]), np.full(len(own), sigma))
+    term = Term(effect, own).at(np.array([p.get(q.name, 0.0) for q in own]), np.full(len(own), np.nan))
     return ArmModel("cell", ROBOT, (term,), "mm", JOINTS)
 
 
@@ -160,7 +164,7 @@ def test_every_controllers_targets_are_moved_alike(controller, tmp_path):
 def test_without_an_error_of_the_arm_every_byte_stays(name, text, tmp_path):
     file = tmp_path / name
     file.write_bytes(text.replace("\n", "\r\n").encode() + "; Größe \n".encode("latin-1"))
-    program = read_program(file, *[ZERO[{".ls": "fanuc", ".mod": "abb"}.get(file.suffix, "kuka")]] * 2)
+    program = read_program(file, *at_zero(file))
     still = np.tile(np.eye(4), (len(program.points), 1, 1))
     texts = compensated_texts(program, still, np.zeros((len(program.points), 6)))
     assert program_bytes(texts[file]) == file.read_bytes()
@@ -169,15 +173,13 @@ def test_without_an_error_of_the_arm_every_byte_stays(name, text, tmp_path):
 @pytest.mark.parametrize(("name", "text"), SAMPLES)
 def test_targets_moved_there_and_back_are_equal_to_the_last_printed_digit(name, text, tmp_path):
     """All numbers are written anew twice: the import of the copy is that of the original."""
-    zeros = [ZERO[{".ls": "fanuc", ".mod": "abb"}.get("." + name.split(".")[1], "kuka")]] * 2
     file = tmp_path / name
     file.write_text(text)
     first = import_file(file)
-    move = np.eye(4)
-    move[:3, :3], move[:3, 3] = Rotation.from_rotvec([3e-3, -2e-3, 1e-3]).as_matrix(), [0.4, -0.3, 0.2]
+    move = frames.make(Rotation.from_rotvec([3e-3, -2e-3, 1e-3]).as_matrix(), np.array([0.4, -0.3, 0.2]))
     turn = np.full(6, 2e-3)
     for T, q in ((move, turn), (np.linalg.inv(move), -turn)):
-        read = read_program(file, *zeros)
+        read = read_program(file, *at_zero(file))
         count = len(read.points)
         before = file.read_text()
         file.write_text(compensated_texts(read, np.tile(T, (count, 1, 1)), np.tile(q, (count, 1)))[file])
@@ -296,8 +298,7 @@ def test_programs_that_cannot_be_moved_are_refused(name, text, options, message,
 def test_what_is_no_target_or_not_read_stays_and_is_named(name, text, other, unread, tmp_path):
     (tmp_path / "a.dat").write_text(KUKA_DAT)
     (tmp_path / name).write_text(text)
-    zeros = [ZERO[{".ls": "fanuc", ".mod": "abb"}.get("." + name.split(".")[1], "kuka")]] * 2
-    read = read_program(tmp_path / name, *zeros)
+    read = read_program(tmp_path / name, *at_zero(tmp_path / name))
     assert read.other == other and read.unread == unread
     assert not {point.name for point in read.points} & set(other)
 
@@ -373,12 +374,6 @@ MOD = "MODULE m\n  CONST robtarget p:=[[100,200,300],[0.5,0.5,0.5,0.5],[0,0,0,0]
 MOD += "  PROC main()\n    MoveL p,v100,fine,grip\\WObj:=rack;\n  ENDPROC\nENDMODULE\n"
 
 
-def pose(x, y, z, a, b, c):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_euler("ZYX", [a, b, c], degrees=True).as_matrix(), [x, y, z]
-    return T
-
-
 NOMINAL, FOUND = pose(2300, 0, 500, 0, 0, 0), pose(2297, 4, 498, 0.3, -0.2, 0.1)
 
 
@@ -386,12 +381,6 @@ def fit_json(folder, **changed):
     found = {"length_unit": "mm", "T_base_part_nominal": NOMINAL.tolist(), "parts": [{"T_base_part": FOUND.tolist()}]}
     (folder / "fit.json").write_text(json.dumps(found | changed))
     return str(folder)
-
-
-def export(*arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(["export", *map(str, arguments)])
-    return stop.value.code
 
 
 def numbers(text):
@@ -402,7 +391,7 @@ def numbers(text):
 def test_targets_stand_to_the_found_part_as_to_the_nominal_one(tmp_path, frame):
     (tmp_path / "place.src").write_text(SRC)
     out = tmp_path / "out.src"
-    assert export(fit_json(tmp_path), "--program", tmp_path / "place.src", "-o", out, "--frame", frame) == 0
+    ended("export", fit_json(tmp_path), "--program", tmp_path / "place.src", "-o", out, "--frame", frame)
     F = pose(*map(float, frame.split(",")))
     for before, after in zip(numbers(SRC), numbers(out.read_text()), strict=True):
         in_part = np.linalg.inv(NOMINAL) @ F @ pose(*before)
@@ -418,13 +407,11 @@ def test_metres_and_a_quaternion(tmp_path):
         tmp_path, length_unit="m", T_base_part_nominal=nominal.tolist(), parts=[{"T_base_part": found.tolist()}]
     )
     (tmp_path / "p.mod").write_text(MOD)
-    assert export(folder, "--program", tmp_path / "p.mod", "-o", tmp_path / "q.mod", "--frame", "0,0,0,1,0,0,0") == 0
+    ended("export", folder, "--program", tmp_path / "p.mod", "-o", tmp_path / "q.mod", "--frame", ZERO["abb"])
     place, q = re.search(r"\[\[(.*?)\],\[(.*?)\]", (tmp_path / "q.mod").read_text()).groups()
     w, *xyz = map(float, q.split(","))
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat([*xyz, w]).as_matrix(), [float(x) for x in place.split(",")]
-    meant = np.eye(4)
-    meant[:3, :3], meant[:3, 3] = Rotation.from_quat([0.5] * 4).as_matrix(), [100, 200, 300]
+    T = frames.make(Rotation.from_quat([*xyz, w]).as_matrix(), np.array([float(x) for x in place.split(",")]))
+    meant = frames.make(Rotation.from_quat([0.5] * 4).as_matrix(), np.array([100, 200, 300]))
     assert np.abs(T - FOUND @ np.linalg.inv(NOMINAL) @ meant).max() < 2e-4
 
 
@@ -438,29 +425,25 @@ def test_metres_and_a_quaternion(tmp_path):
         ({}, "PTP {A1 0, A2 -90, A3 90, A4 0, A5 10, A6 0}\n", (), "line1 is taught by joint angles"),
     ],
 )
-def test_what_cannot_follow_is_refused(tmp_path, capsys, changed, program, more, message):
+def test_what_cannot_follow_is_refused(tmp_path, changed, program, more, message):
     (tmp_path / "place.src").write_text(program)
     told = fit_json(tmp_path, **changed), "--program", tmp_path / "place.src", "-o", tmp_path / "o.src"
-    assert export(*told, "--frame", "0,0,0,0,0,0", *more) == 2
-    assert message in " ".join(capsys.readouterr().err.split()) and not (tmp_path / "o.src").exists()
+    refused = ended("export", *told, "--frame", ZERO["kuka"], *more, code=2).err
+    assert message in " ".join(refused.split()) and not (tmp_path / "o.src").exists()
 
 
 @pytest.mark.parametrize("ending", [".src", ".mod", ".ls", ".script"])
 def test_a_joint_program_is_read_back_with_the_angles_that_were_written(tmp_path, ending):
     file = tmp_path / f"next{ending}"
-    text = next_program(file, ROWS, POSES, ABOUT, j3="own")
-    file.write_bytes(text.encode())
-    points = read_program(file).points
-    read = np.degrees([point.joints for point in points])
+    file.write_bytes(next_program(file, ROWS, POSES, ABOUT, j3="own").encode())
+    read = np.degrees([point.joints for point in read_program(file).points])
     np.testing.assert_allclose(read, ROWS, atol=6e-4)
 
 
 def test_a_yaskawa_job_is_read_back_with_the_flange_in_the_base(tmp_path):
     file = tmp_path / "next.jbi"
     file.write_bytes(next_program(file, ROWS, POSES, ABOUT).encode())
-    points = read_program(file).points
-    read = np.array([point.T_frame_tool for point in points])
-    np.testing.assert_allclose(read, POSES, atol=6e-4)
+    np.testing.assert_allclose([point.T_frame_tool for point in read_program(file).points], POSES, atol=6e-4)
 
 
 @pytest.mark.parametrize("ending", [".src", ".mod", ".ls", ".script", ".jbi"])

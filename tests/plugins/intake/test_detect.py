@@ -23,7 +23,6 @@ from data_synth.fixtures.board_scans import (
     write_board_session,
     write_pcd,
 )
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.units import METRES
@@ -32,6 +31,7 @@ from stitch.plugins.intake.detection.boards import board_sightings, boards_in, l
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
 from stitch.session.session import RangeImage
+from tests.command_line import ended
 
 cv2 = pytest.importorskip("cv2")
 BOARD = "charuco:8x6:12:9:DICT_4X4_50"
@@ -54,13 +54,6 @@ def cell():
     return scans, T_BASE_BOARD @ frames.inverse(poses) @ frames.inverse(T_FLANGE_SCANNER)
 
 
-def ended(capsys, *arguments):
-    with pytest.raises(SystemExit) as end:
-        main([str(a) for a in arguments])
-    printed = capsys.readouterr()
-    return end.value.code or 0, printed.out, printed.err
-
-
 def scatter_in_base(session):
     """Rms distance (mm) of each corner, placed by the true poses, from its mean over the views."""
     placed: dict[str, list[np.ndarray]] = {}
@@ -74,20 +67,17 @@ def scatter_in_base(session):
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2))) * METRES[session.length_unit] * 1e3
 
 
-def test_organised_clouds_with_colour(cell, tmp_path, capsys):
+def test_organised_clouds_with_colour(cell, tmp_path):
     folder = write_board_session(tmp_path / "s", *cell)
-    code, out, err = ended(capsys, "detect", folder, "--board", BOARD, "--json", "-o", folder / "points.csv")
-    assert code == 0, err
+    out, err = ended("detect", folder, "--board", BOARD, "--json", "-o", folder / "points.csv")
     assert json.loads(out)["views"].keys() == {"v0", "v1", "v2"} and "stitch run" in err
     assert scatter_in_base(load_session(folder)) < 0.05
     table = (folder / "points.csv").read_text()
-    code, _, err = ended(capsys, "detect", folder, "--board", BOARD, "-o", folder / "points.csv")
-    assert code == 2 and "exists already" in err
-    code, out, _ = ended(capsys, "detect", folder, "--board", BOARD)
-    assert code == 0 and out == table
+    assert "exists already" in ended("detect", folder, "--board", BOARD, "-o", folder / "points.csv", code=2).err
+    assert ended("detect", folder, "--board", BOARD).out == table
 
 
-def test_depth_images_beside_pictures(cell, tmp_path, capsys):
+def test_depth_images_beside_pictures(cell, tmp_path):
     """Depth in whole tenths of a millimetre, the session in metres: the same corners."""
     scans, poses = cell
     folder = write_board_session(tmp_path / "s", scans, frames.make(poses[:, :3, :3], poses[:, :3, 3] / 1000))
@@ -102,8 +92,7 @@ def test_depth_images_beside_pictures(cell, tmp_path, capsys):
         depth = np.round(np.nan_to_num(scan.points[..., 2]) * 10).astype(np.uint16)
         assert cv2.imwrite(str(folder / f"clouds/depth_{i}.png"), depth)
         Image.fromarray(scan.grey).save(folder / f"clouds/color_{i}.png")
-    code, _, err = ended(capsys, "detect", folder, "--board", BOARD, "-o", folder / "points.csv")
-    assert code == 0, err
+    ended("detect", folder, "--board", BOARD, "-o", folder / "points.csv")
     assert scatter_in_base(load_session(folder)) < 0.05
 
 
@@ -116,21 +105,20 @@ def test_depth_images_beside_pictures(cell, tmp_path, capsys):
         (("--board", "apriltag:36h11:20"), 1, "no view shows"),
     ],
 )
-def test_what_cannot_be_found_ends_in_one_line(cell, tmp_path, capsys, arguments, code, told):
+def test_what_cannot_be_found_ends_in_one_line(cell, tmp_path, arguments, code, told):
     scans, poses = cell
     folder = write_board_session(tmp_path / "s", scans[:1], poses[:1])
-    ended_with, out, err = ended(capsys, "detect", folder, *arguments)
-    assert ended_with == code and told in err and not out and len(err.strip().splitlines()) == 1
+    out, err = ended("detect", folder, *arguments, code=code)
+    assert told in err and not out and len(err.strip().splitlines()) == 1
     assert not (folder / "points.csv").exists()
 
 
-def test_clouds_without_pixels_are_refused(session, capsys):
-    code, _, err = ended(capsys, "detect", session, "--board", BOARD)
-    assert code == 2 and "no scan is an image with brightness" in err
+def test_clouds_without_pixels_are_refused(session):
+    assert "no scan is an image with brightness" in ended("detect", session, "--board", BOARD, code=2).err
 
 
 @pytest.mark.slow
-def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path, capsys):
+def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path):
     """A plane slides on itself under any reading; its corners do not."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     print_ = board_print(cv2.aruco.CharucoBoard((8, 6), 12.0, 9.0, dictionary), 8, 6, 12.0)
@@ -145,9 +133,8 @@ def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path, capsys):
     angles = Rotation.from_matrix(T_base_flange[:, :3, :3]).as_euler("ZYX", degrees=True)
     rows = np.hstack([T_base_flange[:, :3, 3], angles])
     np.savetxt(raw / "poses.txt", rows, fmt="%.6f", delimiter=",")
-    code, out, err = ended(capsys, "init", raw, "--board", BOARD, "--unit", "mm", "--yes", "--json")
-    assert code == 0, err
-    told = {guess["what"]: guess for guess in json.loads(out)["guesses"]}
+    document = json.loads(ended("init", raw, "--board", BOARD, "--unit", "mm", "--yes", "--json").out)
+    told = {guess["what"]: guess for guess in document["guesses"]}
     assert told["rotation"]["told"] and told["rotation"]["value"].startswith("zyx-intrinsic, degrees")
     assert told["pairing"]["told"] and told["targets"]["value"] == "35 in 6 of 6 clouds"
     session = load_session(raw)

@@ -7,27 +7,27 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cli.main import main
+from tests.command_line import ended
 
 SIX = "view;cloud;x;y;z;rx;ry;rz\nv1;a.ply;812,4;-31;655,2;0,5;-0,25;1,5\nv2;b.ply;800;-30;650;0,6;-0,2;1,4\n"
 JOINTS = "j1 j2 j3 j4 j5 j6\n0.1 0.2 0.3 0.4 0.5 0.6\n0.2 0.2 0.3 0.4 0.5 0.6\n"
 
 
 @pytest.fixture
-def imported(tmp_path, capsys):
-    def call(name, text, *flags):
+def imported(tmp_path):
+    """Rows of a table that is imported, and what is said beside them."""
+
+    def call(name, text, *flags, code=0):
         (tmp_path / name).write_text(text, encoding="utf-8")
-        with pytest.raises(SystemExit) as stop:
-            main(["import", str(tmp_path / name), *flags])
-        printed = capsys.readouterr()
-        return stop.value.code or 0, list(csv.DictReader(io.StringIO(printed.out))), printed.err
+        out, err = ended("import", tmp_path / name, *flags, code=code)
+        return list(csv.DictReader(io.StringIO(out))), err
 
     return call
 
 
 def test_a_table_with_what_the_file_does_not_say(imported):
-    code, rows, _ = imported("t.txt", SIX, "--rotation", "zyx-intrinsic", "--angles", "rad", "--unit", "m")
-    assert code == 0 and [row["view"] for row in rows] == ["v1", "v2"] and rows[0]["cloud"] == "a.ply"
+    rows, _ = imported("t.txt", SIX, "--rotation", "zyx-intrinsic", "--angles", "rad", "--unit", "m")
+    assert [row["view"] for row in rows] == ["v1", "v2"] and rows[0]["cloud"] == "a.ply"
     assert [float(rows[0][axis]) for axis in "xyz"] == [0.8124, -0.031, 0.6552]
     q = Rotation.from_quat([float(rows[0][name]) for name in ("qx", "qy", "qz", "qw")])
     # Rz(0.5)·Ry(−0.25)·Rx(1.5), written out.
@@ -37,28 +37,28 @@ def test_a_table_with_what_the_file_does_not_say(imported):
 
 def test_poses_of_the_base_in_the_flange_are_inverted(imported):
     text = "1,0,0,5,0,1,0,6,0,0,1,7,0,0,0,1\n0,-1,0,500,1,0,0,600,0,0,1,700,0,0,0,1\n"
-    _, rows, _ = imported("t.csv", text, "--inverse", "--file-unit", "mm")
+    rows, _ = imported("t.csv", text, "--inverse", "--file-unit", "mm")
     assert [float(rows[1][axis]) for axis in "xyz"] == [-600, 500, -700]
 
 
 def test_times_and_temperatures_come_along(imported):
     text = "time,x,y,z,qx,qy,qz,qw,scanner temperature [C]\n7.5,100,0,500,0,0,0,1,20.5\n9,100,0,510,0,0,0,1,21\n"
-    _, rows, _ = imported("t.txt", text)
+    rows, _ = imported("t.txt", text)
     assert [row["time_s"] for row in rows] == ["0", "1.5"]
     assert [row["scanner_temperature_c"] for row in rows] == ["20.5", "21"]
 
 
 def test_times_of_day_come_along(imported):
     text = "view,time,x,y,z,qx,qy,qz,qw\na,09:59:58.5,100,0,500,0,0,0,1\nb,10:00:01,100,0,510,0,0,0,1\n"
-    _, rows, _ = imported("t.txt", text)
+    rows, _ = imported("t.txt", text)
     assert [row["time_s"] for row in rows] == ["0", "2.5"] and [row["view"] for row in rows] == ["a", "b"]
-    _, rows, said = imported("t.txt", text.replace("09:59:58.5", "11:00:00"))
+    rows, said = imported("t.txt", text.replace("09:59:58.5", "11:00:00"))
     assert "time_s" not in rows[0] and "times of day run backwards" in said
 
 
 def test_joint_angles(imported):
-    code, rows, _ = imported("t.txt", JOINTS, "--angles", "rad")
-    assert code == 0 and "x" not in rows[0]
+    rows, _ = imported("t.txt", JOINTS, "--angles", "rad")
+    assert "x" not in rows[0]
     assert np.allclose([float(rows[1][f"j{i}_deg"]) for i in range(1, 7)], np.degrees([0.2, 0.2, 0.3, 0.4, 0.5, 0.6]))
 
 
@@ -80,18 +80,18 @@ def test_joint_angles(imported):
     ],
 )
 def test_what_the_file_does_not_say_is_asked_for_by_its_flag(imported, name, text, flags, told):
-    code, rows, err = imported(name, text, *flags)
-    assert code == 2 and told in err and not rows and len(err.strip().splitlines()) == 1
+    rows, err = imported(name, text, *flags, code=2)
+    assert told in err and not rows and len(err.strip().splitlines()) == 1
 
 
 def test_programs_and_trackers_keep_their_readers(imported):
-    code, rows, err = imported("t.csv", "name,x,y,z\na,1,2,3\nb,2,3,4\n")
-    assert code == 0 and rows[0]["target"] == "a" and "points.csv" in err
+    rows, err = imported("t.csv", "name,x,y,z\na,1,2,3\nb,2,3,4\n")
+    assert rows[0]["target"] == "a" and "points.csv" in err
 
 
 def test_a_tracker_probe_with_decimal_commas(imported):
     text = "Name;X [m];Y [m];Z [m];Q0;Q1;Q2;Q3\nm1;1,5;-2,25;0,125;0,7071068;0;0,7071068;0\n"
-    _, rows, err = imported("tmac.csv", text)
+    rows, err = imported("tmac.csv", text)
     assert "frames.csv" in err and rows[0]["view"] == "m1"
     assert [float(rows[0][c]) for c in ("x", "y", "z")] == pytest.approx([1500, -2250, 125])
     q = [float(rows[0][c]) for c in ("qx", "qy", "qz", "qw")]
@@ -99,14 +99,14 @@ def test_a_tracker_probe_with_decimal_commas(imported):
 
 
 def test_angles_of_a_tracker_turn_about_fixed_axes(imported):
-    _, rows, _ = imported("probe.csv", "id,x,y,z,Rx (deg),Ry (deg),Rz (deg)\na,1,2,3,10,20,30\nb,1,2,4,10,20,30\n")
+    rows, _ = imported("probe.csv", "id,x,y,z,Rx (deg),Ry (deg),Rz (deg)\na,1,2,3,10,20,30\nb,1,2,4,10,20,30\n")
     turn = Rotation.from_quat([float(rows[0][c]) for c in ("qx", "qy", "qz", "qw")]).as_matrix()
     turns = [Rotation.from_rotvec(np.radians(v)).as_matrix() for v in ([0, 0, 30], [0, 20, 0], [10, 0, 0])]
     assert np.allclose(turn, turns[0] @ turns[1] @ turns[2], atol=1e-8)
 
 
 def test_reflectors_begin_a_view_where_a_name_comes_again(imported):
-    _, rows, err = imported("points.csv", "Point,X,Y,Z\nT1,1,2,3\nT2,4,5,6\nT1,1,2,4\n")
+    rows, err = imported("points.csv", "Point,X,Y,Z\nT1,1,2,3\nT2,4,5,6\nT1,1,2,4\n")
     assert "points.csv" in err
     assert [(row["view"], row["target"], float(row["z"])) for row in rows] == [
         ("v1", "T1", 3),
@@ -118,8 +118,8 @@ def test_reflectors_begin_a_view_where_a_name_comes_again(imported):
 def test_a_recording_of_universal_robots_in_metres(imported):
     header = " ".join(["timestamp", *(f"actual_q_{i}" for i in range(6)), *(f"actual_TCP_pose_{i}" for i in range(6))])
     rows = "\n0.008 0 0 0 0 0 1 0.1 0.2 0.3 0 0 0\n0.016 0 0 0 0 0 2 0.4 0.5 0.6 0 0 0.5\n"
-    code, table, _ = imported("record.csv", header + rows, "--unit", "m", "--angles", "rad")
-    assert code == 0 and [float(table[1][c]) for c in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
+    table, _ = imported("record.csv", header + rows, "--unit", "m", "--angles", "rad")
+    assert [float(table[1][c]) for c in "xyz"] == pytest.approx([0.4, 0.5, 0.6])
     assert float(table[1]["j6_deg"]) == pytest.approx(np.degrees(2))
     assert float(table[1]["qz"]) == pytest.approx(np.sin(0.25))
 
@@ -133,5 +133,5 @@ def test_a_recording_of_universal_robots_in_metres(imported):
     ],
 )
 def test_exports_that_do_not_say_what_they_hold_are_refused(imported, text, told):
-    code, rows, err = imported("a.csv", text)
-    assert code == 2 and told in err and not rows
+    rows, err = imported("a.csv", text, code=2)
+    assert told in err and not rows

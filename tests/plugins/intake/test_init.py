@@ -10,7 +10,6 @@ import pytest
 
 from data_synth.fixtures.raw_folders import Convention, raw_folder
 from data_synth.fixtures.tracker_folders import FOLDERS, tracked_arm
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
@@ -18,6 +17,7 @@ from stitch.plugins.intake.measured_points import measured_session, write_measur
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.capture import prepare_capture
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 from tests.needs import needs
 
 SLOW = ("SpatialAnalyzer", "OptiTrack by time", "Leica's text", "geodetic, by order")
@@ -29,14 +29,7 @@ def raw(session, tmp_path):
     return raw_folder(session, tmp_path / "raw", Convention())
 
 
-def ended(capsys, *arguments):
-    with pytest.raises(SystemExit) as end:
-        main([str(a) for a in arguments])
-    printed = capsys.readouterr()
-    return end.value.code or 0, printed.out, printed.err
-
-
-STATED = (
+STATED = [
     "--rotation",
     "xyz-extrinsic",
     "--angles",
@@ -47,13 +40,11 @@ STATED = (
     "mm",
     "--mount",
     "eye_to_hand",
-)
+]
 
 
-def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
-    code, out, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", "--json", "-o", tmp_path / "made")
-    assert code == 0, err
-    document = json.loads(out)
+def test_what_is_stated_is_taken(raw, session, tmp_path):
+    document = json.loads(ended("init", raw, *STATED, "--no-inverse", "--yes", "--json", "-o", tmp_path / "made").out)
     assert document["views"] == 3 and {g["what"] for g in document["guesses"]} >= {"rotation", "mount", "pairing"}
     assert all(g["because"] in ("file", "scans", "usual") for g in document["guesses"])
     (poses,) = [entry for entry in document["inventory"] if entry["taken_for"] == "poses"]
@@ -62,11 +53,10 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     for a, b in zip(made.views, true.views, strict=True):
         assert abs(a.T_base_flange - b.T_base_flange).max() < 1e-3
     assert not (raw / "session.toml").exists()
-    code, _, err = ended(capsys, "init", raw, *STATED, "--yes", "-o", tmp_path / "made")
-    assert code == 2 and "exists already; to fix: replace it with --force" in err
-    other = [*STATED[:-1], "eye_in_hand"]
-    code, _, err = ended(capsys, "init", raw, *other, "--yes", "-o", tmp_path / "made", "--force")
-    assert code == 0 and load_session(tmp_path / "made").mount == "eye_in_hand"
+    refused = ended("init", raw, *STATED, "--yes", "-o", tmp_path / "made", code=2)
+    assert "exists already; to fix: replace it with --force" in refused.err
+    ended("init", raw, *STATED[:-1], "eye_in_hand", "--yes", "-o", tmp_path / "made", "--force")
+    assert load_session(tmp_path / "made").mount == "eye_in_hand"
     comment = (tmp_path / "made" / "session.toml").read_text(encoding="utf-8")
     assert "--force, with the flag" in comment and "(--rotation" in " ".join(comment.split())
 
@@ -76,9 +66,9 @@ def second_table(raw):
     (raw / "robot.txt").write_text((raw / "RobotPoses.dat").read_text().replace("0.", "0.1"))
 
 
-def test_what_is_only_guessed_is_known_to_the_session_until_a_person_states_otherwise(raw, tmp_path, capsys):
-    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", "-o", tmp_path / "made")
-    assert code == 0 and load_session(tmp_path / "made").usual == {}, err
+def test_what_is_only_guessed_is_known_to_the_session_until_a_person_states_otherwise(raw, tmp_path):
+    ended("init", raw, *STATED, "--no-inverse", "--yes", "-o", tmp_path / "made")
+    assert load_session(tmp_path / "made").usual == {}
     toml = tmp_path / "made" / "session.toml"
     guessed = "# ? cloud_unit: mm; scans are 150 long\n# ? rotation: xyz-extrinsic, radians; told by\n"
     toml.write_text(guessed + toml.read_text())
@@ -87,40 +77,39 @@ def test_what_is_only_guessed_is_known_to_the_session_until_a_person_states_othe
     assert load_session(tmp_path / "made", scans=False).usual == {"rotation": "xyz-extrinsic"}
 
 
-def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path, capsys):
+def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path):
     clouds = [view.cloud.points for view in load_session(session).views]
     low, high = (np.quantile(np.concatenate(clouds), share, axis=0) for share in (0.1, 0.9))
     box = f"--within={','.join(f'{x:.6f}' for x in (*low, *high))}"
-    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", box, "-o", tmp_path / "made")
-    assert code == 0, err
+    ended("init", raw, *STATED, "--no-inverse", "--yes", box, "-o", tmp_path / "made")
     for view, points in zip(load_session(tmp_path / "made").views, clouds, strict=True):
         assert view.cloud.count == ((points > low) & (points < high)).all(axis=1).sum() < len(points)
-    code, _, err = ended(capsys, "init", raw, "--within", "1,1,1,0,0,0")
-    assert code == 2 and "the lowest and the highest corner" in err
+    assert "the lowest and the highest corner" in ended("init", raw, "--within", "1,1,1,0,0,0", code=2).err
+
+
+@pytest.fixture
+def contradicted(raw):
+    """The raw folder with poses that fit no scans."""
+    (raw / "RobotPoses.dat").write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
+    return raw
 
 
 @pytest.mark.slow
-def test_poses_that_fit_no_scans_make_no_session(raw, capsys):
-    table = raw / "RobotPoses.dat"
-    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
-    code, _, err = ended(capsys, "init", raw, "--yes")
-    assert code == 2 and "no session was written" in err and "Next" not in err
-    assert not (raw / "session.toml").exists()
+def test_poses_that_fit_no_scans_make_no_session(contradicted):
+    told = ended("init", contradicted, "--yes", code=2).err
+    assert "no session was written" in told and "Next" not in told
+    assert not (contradicted / "session.toml").exists()
 
 
 @pytest.mark.slow
-def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, capsys):
-    table = raw / "RobotPoses.dat"
-    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
-    code, _, err = ended(capsys, "init", raw)
-    assert code == 2 and "--rotation" in err and "--mount" in err and "--yes" in err
-    assert not (raw / "session.toml").exists() and not (raw / "views.csv").exists()
+def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(contradicted):
+    told = ended("init", contradicted, code=2).err
+    assert "--rotation" in told and "--mount" in told and "--yes" in told
+    assert not (contradicted / "session.toml").exists() and not (contradicted / "views.csv").exists()
 
 
 @pytest.mark.slow
-def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
-    table = raw / "RobotPoses.dat"
-    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
+def test_a_terminal_is_asked_what_cannot_be_told(contradicted, monkeypatch):
     # A typing error costs a question, not the work so far.
     answers = iter(["zyx-intrinsik", "", "", "zyx-intrinsic", "", "eye_in_hand", "y"])
     asked = []
@@ -128,16 +117,15 @@ def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
     told = lambda text, err, default="": asked.append(text) or next(answers) or default  # noqa: E731
     monkeypatch.setattr("typer.prompt", told)
     monkeypatch.setattr("typer.confirm", lambda text, default, err: next(answers) == "y")
-    code, _, err = ended(capsys, "init", raw)
-    assert code == 0, err
+    err = ended("init", contradicted).err
     first = ["rotation", "length_unit", "mount"]
     assert [text.split()[0] for text in asked] == [*first, "--rotation", *first[1:]]
     assert "--rotation zyx-intrinsik" in err
-    text = (raw / "session.toml").read_text(encoding="utf-8")
+    text = (contradicted / "session.toml").read_text(encoding="utf-8")
     assert "zyx-intrinsic" in text and 'mount = "eye_in_hand"' in text
 
 
-def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, monkeypatch):
+def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, monkeypatch):
     """Eight columns of which two are something else: they are shown, numbered, and named by an answer."""
     table = raw / "RobotPoses.dat"
     table.write_text("".join(f"{i}.5,7.25,{row}\n" for i, row in enumerate(table.read_text().splitlines())))
@@ -145,8 +133,8 @@ def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, mon
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     monkeypatch.setattr("typer.prompt", lambda text, err: asked.append(text) or "-,-,rx,ry,rz,x,y,z")
     monkeypatch.setattr("typer.confirm", lambda text, default, err: True)
-    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse")
-    assert code == 0 and asked == ["--columns"], err
+    err = ended("init", raw, *STATED, "--no-inverse").err
+    assert asked == ["--columns"]
     assert "hold no pose that is known" in err and any(line.split()[:3] == ["1", "2", "3"] for line in err.splitlines())
     assert load_session(raw).views
 
@@ -166,19 +154,19 @@ def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, mon
         (lambda raw: (raw / "RobotPoses.dat").write_text("1,2,3,4,5,6\n" * 9), (), "3 clouds and 9 poses"),
     ],
 )
-def test_what_cannot_be_a_session_is_refused_in_one_line(raw, capsys, spoil, arguments, told):
+def test_what_cannot_be_a_session_is_refused_in_one_line(raw, spoil, arguments, told):
     spoil(raw)
-    code, out, err = ended(capsys, "init", raw, "--yes", *arguments)
-    assert code == 2 and told in err and not out
+    out, err = ended("init", raw, "--yes", *arguments, code=2)
+    assert told in err and not out
     assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
 
 
 @pytest.mark.parametrize("arguments", [STATED[:-2], ("--rows", "1-2")])
-def test_a_question_is_asked_in_the_json_with_what_is_known_by_then(raw, capsys, arguments):
+def test_a_question_is_asked_in_the_json_with_what_is_known_by_then(raw, arguments):
     """Without --yes nobody guesses: what cannot be told is the question, and nothing is written."""
-    code, out, err = ended(capsys, "init", raw, "--json", *arguments)
+    out, err = ended("init", raw, "--json", *arguments, code=2)
     told = json.loads(out)
-    assert code == 2 and "stitch:" in err and not (raw / "session.toml").exists()
+    assert "stitch:" in err and not (raw / "session.toml").exists()
     assert {"guesses", "inventory", "not_used", "question"} <= set(told)
     assert set(told["question"]) >= {"what", "options"}
     assert [set(row) for row in told["inventory"]] == [{"file", "list", "rows", "columns", "taken_for", "why_not"}]

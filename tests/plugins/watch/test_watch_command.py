@@ -25,11 +25,12 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.run_folders import bare_run
-from stitch.cli.main import main
+from stitch.numerics import frames
 from stitch.plugins.watch import serve
 from stitch.plugins.watch.history import mount_twist, open_history, read_record, twist_covariance
 from stitch.plugins.watch.serve import Inbox
 from stitch.plugins.watch.update import append_runs
+from tests.command_line import ended
 
 SIGMA = np.diag([2e-5] * 3 + [0.01] * 3) ** 2
 PROGRAM = "from stitch.plugins.watch.serve import serve; import sys; serve(__import__('pathlib').Path(sys.argv[1]), port=int(sys.argv[2]), host='127.0.0.1', token='secret', workers=1, scheduler='')"
@@ -37,10 +38,9 @@ PROGRAM = "from stitch.plugins.watch.serve import serve; import sys; serve(__imp
 
 def run_folder(folder: Path, name: str, shift: float = 0.0, c2: float = 1e-6) -> Path:
     """A run that found the mount somewhere, an hour after the one before."""
-    T = np.eye(4)
     rng = np.random.default_rng(int(name[1:]))
-    T[:3, :3] = Rotation.from_rotvec([0.1, 2.0, 0.3] + 1e-5 * rng.normal(size=3)).as_matrix()
-    T[:3, 3] = [1200.0 + shift, -50.0, 700.0] + 0.005 * rng.normal(size=3)
+    R = Rotation.from_rotvec([0.1, 2.0, 0.3] + 1e-5 * rng.normal(size=3)).as_matrix()
+    T = frames.make(R, [1200.0 + shift, -50.0, 700.0] + 0.005 * rng.normal(size=3))
     effects = {"joint_compliance": {"c2": (c2 * (1 + 0.02 * rng.normal()), "rad/(N m)")}}
     run = bare_run(folder / name, T, SIGMA, mount="eye_to_hand", name=name, effects=effects)
     time = 1.79e9 + 3600 * int(name[1:])
@@ -48,20 +48,12 @@ def run_folder(folder: Path, name: str, shift: float = 0.0, c2: float = 1e-6) ->
     return run
 
 
-def ends(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(a) for a in arguments])
-    return int(stop.value.code or 0)
-
-
-def test_a_knock_ends_with_3_and_its_session(tmp_path, capsys):
+def test_a_knock_ends_with_3_and_its_session(tmp_path):
     runs = [run_folder(tmp_path, f"s{k}", shift=0.2 * (k >= 20)) for k in range(24)]
     cell = tmp_path / "cell-7"
-    assert ends("watch", cell, "--add", *runs[:20], "--json") == 0
-    quiet = json.loads(capsys.readouterr().out)
+    quiet = json.loads(ended("watch", cell, "--add", *runs[:20], "--json").out)
     assert [p["alarm"] for p in quiet["parameters"]] == [None] * 7
-    assert ends("watch", cell, "--add", *runs, "--json") == 3
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(ended("watch", cell, "--add", *runs, "--json", code=3).out)
     assert told["sessions"] == 24
     alarm = next(p["alarm"] for p in told["parameters"] if p["name"] == "hand_eye.x")
     assert (alarm["since"], alarm["kind"]) == ("s20", "step")
@@ -69,22 +61,18 @@ def test_a_knock_ends_with_3_and_its_session(tmp_path, capsys):
     assert alarm["size"] == pytest.approx(0.2, abs=0.01)
     for name in ("watch.html", "watch.prom", "history.sqlite"):
         assert (cell / name).stat().st_size > 500
-    assert ends("watch", cell, "--no-page") == 3
-    assert "the mount jumped before session s20" in " ".join(capsys.readouterr().out.split())
+    assert "the mount jumped before session s20" in " ".join(ended("watch", cell, "--no-page", code=3).out.split())
     # A new calibration, of after the knock: what was is settled.
-    assert ends("watch", cell, "--in-use", runs[23], "--json") == 0
-    assert json.loads(capsys.readouterr().out)["in_use"] == "s23"
+    assert json.loads(ended("watch", cell, "--in-use", runs[23], "--json").out)["in_use"] == "s23"
 
 
-def test_a_plant_has_a_page_with_a_row_a_cell(tmp_path, capsys):
+def test_a_plant_has_a_page_with_a_row_a_cell(tmp_path):
     cells = []
     for c in range(2):
         runs = [run_folder(tmp_path, f"s{10 * c + k}") for k in range(3)]
         cells.append(tmp_path / f"cell-{c}")
-        assert ends("watch", cells[-1], "--add", *runs, "--no-page") == 0
-    capsys.readouterr()
-    assert ends("watch", *cells, "--json") == 0
-    assert [cell["cell"] for cell in json.loads(capsys.readouterr().out)] == ["cell-0", "cell-1"]
+        ended("watch", cells[-1], "--add", *runs, "--no-page")
+    assert [cell["cell"] for cell in json.loads(ended("watch", *cells, "--json").out)] == ["cell-0", "cell-1"]
     page = (tmp_path / "plant.html").read_text(encoding="utf-8")
     assert 'href="cell-0/watch.html"' in page
 
@@ -106,7 +94,7 @@ def test_a_plant_has_a_page_with_a_row_a_cell(tmp_path, capsys):
         (("cell", "--add", "reused"), "as it is, so nothing was measured anew"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line_and_leaves_nothing(arguments, told, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_is_refused_in_one_line_and_leaves_nothing(arguments, told, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("s0", "s1"):
         run_folder(tmp_path, name)
@@ -122,26 +110,20 @@ def test_what_cannot_be_is_refused_in_one_line_and_leaves_nothing(arguments, tol
     reused.write_text(json.dumps(json.loads(reused.read_text()) | {"stages": [stage | note]}))
     if told is None:
         # Metres after millimetres: another cell.
-        assert ends("watch", "cell", "--add", "s0", "--no-page") == 0
-        told = "has length_unit m, the cell cell mm"
-        capsys.readouterr()
-        assert ends("watch", *arguments) == 2
-        assert told in capsys.readouterr().err
+        ended("watch", "cell", "--add", "s0", "--no-page")
+        assert "has length_unit m, the cell cell mm" in ended("watch", *arguments, code=2).err
         return
-    assert ends("watch", *arguments) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert told in lines[-1]
+    assert told in ended("watch", *arguments, code=2).err.strip().splitlines()[-1]
     assert not (tmp_path / "cell").exists()
 
 
-def test_a_damaged_history_is_named(tmp_path, capsys):
+def test_a_damaged_history_is_named(tmp_path):
     (tmp_path / "cell").mkdir()
     (tmp_path / "cell" / "history.sqlite").write_bytes(b"no data base" * 500)
-    assert ends("watch", tmp_path / "cell") == 2
-    assert "history.sqlite: damaged" in capsys.readouterr().err
+    assert "history.sqlite: damaged" in ended("watch", tmp_path / "cell", code=2).err
 
 
-def test_a_database_of_something_else_is_left_as_it_is(tmp_path, capsys):
+def test_a_database_of_something_else_is_left_as_it_is(tmp_path):
     run = run_folder(tmp_path, "s0")
     (tmp_path / "cell").mkdir()
     file = tmp_path / "cell" / "history.sqlite"
@@ -149,8 +131,8 @@ def test_a_database_of_something_else_is_left_as_it_is(tmp_path, capsys):
     connection.execute("CREATE TABLE parts (name)")
     connection.close()
     before = file.read_bytes()
-    assert ends("watch", tmp_path / "cell", "--add", run) == 2
-    assert "is no history in the form" in capsys.readouterr().err and file.read_bytes() == before
+    told = ended("watch", tmp_path / "cell", "--add", run, code=2)
+    assert "is no history in the form" in told.err and file.read_bytes() == before
 
 
 def test_many_writers_lose_nothing(tmp_path):

@@ -6,13 +6,13 @@ import io
 import numpy as np
 import pytest
 
-from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.intake.controllers.program import import_file
 from stitch.plugins.intake.controllers.taught_points import fixed_xyz, quaternion_w_first, rotation_vector, zyx
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.views_table import read_views
+from tests.command_line import ended
 from tests.plugins.intake.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 
@@ -167,20 +167,16 @@ def test_bad_options_and_programs_without_points(tmp_path):
         import_file(tmp_path / "e.mod")
 
 
-def test_command_writes_once(tmp_path, capsys):
+def test_command_writes_once(tmp_path):
     (tmp_path / "p.mod").write_text(ABB)
     target = tmp_path / "views.csv"
-    for code in (0, 2):
-        with pytest.raises(SystemExit) as stop:
-            cli.main(["import", str(tmp_path / "p.mod"), "-o", str(target)])
-        assert stop.value.code == code
-    assert "7 rows of views.csv" in (text := capsys.readouterr().err) and "exists already" in text
+    assert "7 rows of views.csv" in ended("import", tmp_path / "p.mod", "-o", target).err
+    assert "exists already" in ended("import", tmp_path / "p.mod", "-o", target, code=2).err
     assert target.read_text().startswith("view,j1_deg,")
 
 
-def test_the_command_warns_of_the_program_and_not_of_the_table(tmp_path, capsys):
+def test_the_command_warns_of_the_program_and_not_of_the_table(tmp_path):
     program = tmp_path / "p.ls"
     program.write_text(FANUC)
-    with pytest.raises(SystemExit):
-        cli.main(["import", str(program), "-o", str(tmp_path / "views.csv")])
-    assert f"stitch: {program}: poses are those of the tool" in capsys.readouterr().err
+    told = ended("import", program, "-o", tmp_path / "views.csv")
+    assert f"stitch: {program}: poses are those of the tool" in told.err

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.sphere_scans import RADIUS, SphereCell, area_scan, line_scan, sphere_cell, write_spheres
-from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.intake.detection.balls import fit_ball
@@ -25,6 +24,7 @@ from stitch.plugins.metrology.calibrate.sphere_fit import (
     sphere_view,
 )
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 
 def views_of(cell, side=0.0):
@@ -105,20 +105,17 @@ def test_decoupled_is_exact_where_orientations_are_equal_and_absent_where_none_a
 
 
 @pytest.mark.parametrize("mount", [pytest.param("eye_in_hand", marks=pytest.mark.slow), "eye_to_hand"])
-def test_command_on_both_mounts(mount, tmp_path, capsys):
+def test_command_on_both_mounts(mount, tmp_path):
     cell = sphere_cell(5, "line", turns=0.6)
     folder = write_spheres(cell, tmp_path / "s", mount)
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["calibrate", "sphere", str(folder), "--json"])
-    assert stop.value.code == 0
-    document = json.loads(capsys.readouterr().out)
+    document = json.loads(ended("calibrate", "sphere", folder, "--json").out)
     found = np.array(document["hand_eye"])
     assert np.abs(twist(cell, found) / document["hand_eye_sigma"]).max() < 4
     assert document["mount"] == mount and len(document["views"]) == len(cell.G)
 
 
 @pytest.mark.slow
-def test_metres_give_what_millimetres_give(tmp_path, capsys):
+def test_metres_give_what_millimetres_give(tmp_path):
     cell = sphere_cell(6, "line", turns=0.6)
     found = [
         calibrate_sphere(load_session(write_spheres(cell, tmp_path / unit, unit=unit))).fit for unit in ("mm", "m")
@@ -127,9 +124,7 @@ def test_metres_give_what_millimetres_give(tmp_path, capsys):
     assert found[1].T_mount[:3, 3] * 1000 == pytest.approx(found[0].T_mount[:3, 3], abs=0.002)
     sigma = [np.sqrt(np.diag(fit.covariance)) for fit in found]
     assert sigma[1] * scale == pytest.approx(sigma[0], rel=0.05)
-    with pytest.raises(SystemExit):
-        cli.main(["calibrate", "sphere", str(tmp_path / "m")])
-    assert " m rms" in capsys.readouterr().err
+    assert " m rms" in ended("calibrate", "sphere", tmp_path / "m").err
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.hand_eye import shah
 from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, refine_axzb, tracker_document
 from stitch.session.reading.session_folder import load_session
+from tests.command_line import ended
 
 HEADER = "view,x,y,z,qx,qy,qz,qw"
 
@@ -67,12 +67,9 @@ def test_error_is_that_of_the_covariance(mount, tmp_path):
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_command(as_json, tmp_path, capsys):
+def test_command(as_json, tmp_path):
     truth = session(tmp_path / "s", "eye_to_hand")
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["calibrate", "tracker", str(tmp_path / "s"), *(["--json"] if as_json else [])])
-    assert stop.value.code == 0
-    out = capsys.readouterr()
+    out = ended("calibrate", "tracker", tmp_path / "s", *(["--json"] if as_json else []))
     if as_json:
         assert np.abs(np.array(json.loads(out.out)["hand_eye"]) - truth).max() < 0.5
     else:
