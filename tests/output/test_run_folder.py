@@ -7,6 +7,7 @@ A run read back from its folder; the Python file that its model names is run onl
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,10 +110,7 @@ def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
 
 
 def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path):
-    run = tmp_path / "r"
-    run.mkdir()
-    for name, data in files(folder / "r").items():
-        (run / name).write_bytes(data)
+    run = shutil.copytree(folder / "r", tmp_path / "r")
     k = repr(told(run)["effects"][EFFECT]["k"]["value"])
     (run / "model.toml").write_text((run / "model.toml").read_text().replace(k, "1e-5"))
     line = ended("report", run, code=2).err.strip()
@@ -122,10 +120,8 @@ def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path):
 
 def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monkeypatch, stitch_command):
     """The page keeps what it said, and nothing is added where it names nothing; of another state it is forgotten."""
-    run, page = tmp_path / "r", tmp_path / "r" / "report.html"
-    run.mkdir()
-    for name, data in files(folder / "q").items():
-        (run / name).write_bytes(data)
+    run = shutil.copytree(folder / "q", tmp_path / "r")
+    page = run / "report.html"
     document = {"verdict": "adequate", "plain": "Nothing.", "sentence": "Nothing at all.", "notes": []}
     document |= {"next_command": "Next: stitch export RUN --to ros", "of": diagnosed_state(load_run(run), run)}
     (run / "diagnosis.json").write_text(json.dumps(document))
@@ -152,10 +148,8 @@ STALE = ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recordi
 @pytest.fixture
 def changing(folder, tmp_path, monkeypatch):
     """A copy of `q` with everything beside it that commands make of a model; changes take no time."""
-    run = tmp_path / "q"
-    (run / "pictures").mkdir(parents=True)
-    for name, data in files(folder / "q").items():
-        (run / name).write_bytes(data)
+    run = shutil.copytree(folder / "q", tmp_path / "q")
+    (run / "pictures").mkdir(exist_ok=True)
     for name in (*STALE, "pictures/budget.png"):
         (run / name).write_text("of the old model")
     result = replace(load_run(run), ledger=())

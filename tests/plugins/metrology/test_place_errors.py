@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.scanner import Scanner, scan_waves
+from data_synth.scene import load_scene
 from data_synth.shapes.spheres import SpherePlate, centres
 from stitch.api.pipeline import run
 from stitch.numerics import frames
@@ -36,23 +37,27 @@ PLATE = SpherePlate(radius=28.0)
 RNG = np.random.default_rng(5)
 TURN = Rotation.from_rotvec([0.4, -0.3, 0.2]).as_matrix()
 AT = np.array([30.0, -20.0, 100.0])
+_COUNT = 400  # points of a shape
 
 
 @pytest.fixture(scope="module")
 def cell():
     """A measured session of a sphere plate, its run, and what is asked of it."""
-    scene = clean("spheres", rays=90, noise=0.02)
-    part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
-    scene = replace(scene, part=part, repeatability=(15e-6, 0.01))
-    measured = simulated(scene, {}, 3, views=6)
-    T = scene.T_reference_part
+    state = _plate_run(3)
+    T = load_scene("spheres").T_reference_part
     balls = frames.transform(T, centres(PLATE))
     wanted = [Feature(f"ball {i}", "sphere", at=at, size=56.0, within=2.0) for i, at in enumerate(balls[:3])]
     wanted.append(Feature("apart", "distance", between=("ball 0", "ball 1")))
     at = frames.transform(T, np.array([[-45.0, 0.0, 0.0]]))[0]
     wanted.append(Feature("top", "plane", at=at, axis=T[:3, 2], radius=30.0, within=2.0))
-    state = run(session_of(measured))
     return state, place_errors(state), FeatureList(tuple(wanted))
+
+
+def _plate_run(seed, **scanner):
+    """A run of a plate of spheres by a scanner that errs so."""
+    scene = clean("spheres", rays=90, noise=0.02, **scanner)
+    part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
+    return run(session_of(simulated(replace(scene, part=part, repeatability=(15e-6, 0.01)), {}, seed, views=6)))
 
 
 def _numbers(state, wanted):
@@ -267,10 +272,7 @@ def test_every_fused_point_has_a_sigma_of_the_size_of_a_small_patch(cell):
 
 
 def _measured_errors(size: float, length: float, seed: int):
-    scene = clean("spheres", rays=90, noise=0.02, scan_error=size, scan_error_length=length)
-    part = replace(scene.part, labelled=False, parameters={"radius": SpherePlate(radius=28.0).radius})
-    scene = replace(scene, part=part, repeatability=(15e-6, 0.01))
-    return place_errors(run(session_of(simulated(scene, {}, seed, views=6)))).scan_errors
+    return place_errors(_plate_run(seed, scan_error=size, scan_error_length=length)).scan_errors
 
 
 @pytest.mark.parametrize(
@@ -305,21 +307,22 @@ def test_the_order_of_the_views_changes_nothing(monkeypatch):
     assert sizes[0] == pytest.approx(sizes[1], rel=1e-6)
 
 
-def _sphere(n=400):
-    normal = RNG.standard_normal((n, 3))
+def _sphere():
+    normal = RNG.standard_normal((_COUNT, 3))
     normal[:, 2] = np.abs(normal[:, 2])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return 12.5 * normal, normal
 
 
-def _cylinder(n=400):
-    angle = RNG.uniform(0, 4.0, n)
-    normal = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
-    return 8.0 * normal + np.column_stack([np.zeros((n, 2)), RNG.uniform(-15, 15, n)]), normal
+def _cylinder():
+    angle = RNG.uniform(0, 4.0, _COUNT)
+    normal = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(_COUNT)])
+    return 8.0 * normal + np.outer(RNG.uniform(-15, 15, _COUNT), [0, 0, 1]), normal
 
 
-def _plane(n=400):
-    return np.column_stack([RNG.uniform(-9, 9, (n, 2)), np.zeros(n)]), np.tile([0.0, 0.0, 1.0], (n, 1))
+def _plane():
+    places = np.column_stack([RNG.uniform(-9, 9, (_COUNT, 2)), np.zeros(_COUNT)])
+    return places, np.tile([0.0, 0.0, 1.0], (_COUNT, 1))
 
 
 SHAPES = {
