@@ -15,15 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGET = ROOT / "budget.toml"
 # A budget may lie above the count by this share.
 SLACK = 0.02
-_NO_CODE = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENCODING,
-    tokenize.ENDMARKER,
-}
+_NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
+_NO_CODE |= {tokenize.ENCODING, tokenize.ENDMARKER}
 
 
 def code_lines(file: Path) -> int:

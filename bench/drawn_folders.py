@@ -19,6 +19,7 @@ from bench.intake import campaigns
 from data_synth.fixtures.drawn_folders import MM, Truth, draw_folder
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.make_session import Made, make_session
 from stitch.plugins.intake.refusals import Refusal
 from stitch.session.reading.session_folder import load_session
@@ -43,31 +44,36 @@ def trial(job: Row) -> Row:
         folder, out = Path(scratch) / "scans", Path(scratch) / "session"
         folder.mkdir()
         truth = drawn.write(folder, campaign)
-        options: dict[str, str] = {}
-        asked: list[str] = []
-        outcome, marked, unmarked, told = "", 0, 0, ""
-        for _ in range(STEPS):
-            try:
-                made = make_session(folder, out, options, guess=bool(asked), force=True)
-                session = load_session(out)
-            except InputError as refused:
-                told = refused.what.replace(str(folder), "scans")
-                answer = answer_of(refused, truth, options)
-                if answer is None:
-                    outcome = "refused, true cause" if truth.cause and re.search(truth.cause, told) else "refused"
-                    break
-                options |= answer
-                asked += answer
-                continue
-            outcome = verdict(session, made, truth, campaign.clouds)
-            usual = [g.what for g in made.guesses if g.because == "usual"]
-            marked = sum(what in ("rotation", "pairing", "columns") for what in usual)
-            unmarked = len(made.guesses) - len(usual)
-            break
+        outcome, asked, told, guesses = answered(folder, out, truth, campaign.clouds)
+    usual = [guess.what for guess in guesses if guess.because == "usual"]
+    marked = sum(what in ("rotation", "pairing", "columns") for what in usual)
+    unmarked = len(guesses) - len(usual)
     drawing = {"format": drawn.format, "mistake": drawn.mistake, "inverse": drawn.inverse}
     drawing |= {"units": f"{drawn.unit}/{drawn.cloud_unit}", "named": drawn.named}
     counts = {"marked": marked, "unmarked": unmarked}
-    return drawing | counts | {"outcome": outcome or "circle", "asked": asked, "told": told[:300]}
+    return drawing | counts | {"outcome": outcome, "asked": asked, "told": told[:300]}
+
+
+def answered(
+    folder: Path, out: Path, truth: Truth, clouds: tuple[np.ndarray, ...]
+) -> tuple[str, list[str], str, tuple[Guess, ...]]:
+    """Return what becomes of a folder that is answered, what it asked, its last refusal, and the guesses."""
+    options: dict[str, str] = {}
+    asked: list[str] = []
+    told = ""
+    for _ in range(STEPS):
+        try:
+            made = make_session(folder, out, options, guess=bool(asked), force=True)
+            return verdict(load_session(out), made, truth, clouds), asked, told, made.guesses
+        except InputError as refused:
+            told = refused.what.replace(str(folder), "scans")
+            answer = answer_of(refused, truth, options)
+        if answer is None:
+            known = truth.cause and re.search(truth.cause, told)
+            return "refused, true cause" if known else "refused", asked, told, ()
+        options |= answer
+        asked += answer
+    return "circle", asked, told, ()
 
 
 def answer_of(refused: InputError, truth: Truth, given: dict[str, str]) -> dict[str, str] | None:

@@ -10,14 +10,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bench.drawn_folders import STEPS, answer_of, verdict
+from bench.drawn_folders import answered
 from bench.harness import Row, Table, markdown
 from bench.intake import campaigns
 from data_synth.fixtures.drawn_folders import Truth
 from data_synth.fixtures.field_folders import Array, Campaign, ply
-from stitch.errors import InputError
-from stitch.plugins.intake.make_session import make_session
-from stitch.session.reading.session_folder import load_session
 
 K = [615.3, 0.0, 321.7, 0.0, 615.1, 240.2, 0.0, 0.0, 1.0]
 
@@ -41,13 +38,9 @@ def _rows(M: Array) -> str:
 def bop(folder: Path, c: Campaign) -> list[str]:
     """scene_camera.json of BOP: cam_R_w2c and cam_t_w2c (mm) are T_camera_world; cam_K is the lens."""
     inverse = np.linalg.inv(c.T)
+    lens = {"cam_K": K, "depth_scale": 1.0}
     told = {
-        str(i): {
-            "cam_K": K,
-            "cam_R_w2c": T[:3, :3].ravel().tolist(),
-            "cam_t_w2c": T[:3, 3].tolist(),
-            "depth_scale": 1.0,
-        }
+        str(i): lens | {"cam_R_w2c": T[:3, :3].ravel().tolist(), "cam_t_w2c": T[:3, 3].tolist()}
         for i, T in enumerate(inverse)
     }
     (folder / "scene_camera.json").write_text(json.dumps(told))
@@ -74,11 +67,8 @@ def scanner_app(folder: Path, c: Campaign) -> list[str]:
     """frame_00000.json of 3D Scanner App: cameraPoseARFrame by rows, beside a projection and a lens; metres."""
     projection = np.array([[1.7, 0, 0.01, 0], [0, 2.3, 0, 0], [0, 0, -1, -2e-3], [0, 0, -1, 0]])
     for i, T in enumerate(_metres(c.T)):
-        told = {
-            "cameraPoseARFrame": T.ravel().tolist(),
-            "intrinsics": K,
-            "projectionMatrix": projection.ravel().tolist(),
-        }
+        told = {"cameraPoseARFrame": T.ravel().tolist(), "intrinsics": K}
+        told |= {"projectionMatrix": projection.ravel().tolist()}
         told |= {"mvp": (projection @ T).ravel().tolist(), "time": 12.4 + i, "frame_index": i}
         (folder / f"frame_{i:05d}.json").write_text(json.dumps(told))
     return _scans(folder, c, "frame_{:05d}.ply", 1e-3)
@@ -171,27 +161,15 @@ def trial(job: Row) -> Row:
         unit = "mm" if job["form"] in ("bop", "mvsnet") else "m"
         answers = {"unit": unit, "cloud_unit": unit, "mount": "eye_in_hand"}
         truth = Truth(tuple(names), campaign.T, tuple(range(len(names))), "", answers)
-        options: dict[str, str] = {}
-        said = ""
-        for asked in range(STEPS):
-            try:
-                made = make_session(folder, out, options, guess=bool(asked), force=True)
-            except InputError as refused:
-                said = refused.command_line.replace(str(folder), "scans")
-                answer = answer_of(refused, truth, options)
-                if answer is None:
-                    return {"outcome": "refused", "asked": asked, "said": said}
-                options |= answer
-                continue
-            return {"outcome": verdict(load_session(out), made, truth, campaign.clouds), "asked": asked, "said": said}
-    return {"outcome": "circle", "asked": STEPS, "said": said}
+        outcome, asked, told, _ = answered(folder, out, truth, campaign.clouds)
+    return {"outcome": outcome, "asked": asked, "told": told}
 
 
 def summary(rows: list[Row]) -> list[str]:
     """A line a form, and how many are right."""
-    right = sum(row["outcome"] == "right" and row["asked"] < 2 for row in rows)
-    lines = [[row["form"], row["outcome"], row["asked"]] for row in rows]
-    return [*markdown("form | what becomes of it | questions", lines), "", f"{right} of {len(rows)} right."]
+    right = sum(row["outcome"] == "right" and len(row["asked"]) < 2 for row in rows)
+    lines = [[row["form"], row["outcome"], ", ".join(row["asked"]) or "–"] for row in rows]
+    return [*markdown("form | what becomes of it | asked", lines), "", f"{right} of {len(rows)} right."]
 
 
 FOUND = Table(jobs, trial, summary, range(41, 42))

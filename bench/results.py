@@ -45,13 +45,7 @@ class Room:
         if command not in self.printed:
             programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
             paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-            environment = {
-                **os.environ,
-                "PATH": programs,
-                "PYTHONPATH": paths,
-                "OMP_NUM_THREADS": "1",
-                "COLUMNS": "200",
-            }
+            environment = os.environ | {"PATH": programs, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
             call, here = shlex.split(command), ROOT if "pytest" in command else self.folder
             done = subprocess.run(call, cwd=here, env=environment, check=False, capture_output=True, text=True)
             self.printed[command] = done.stdout or done.stderr
@@ -89,9 +83,8 @@ class Room:
 
     def hidden_found(self, command: str) -> str:
         revealed = self.json("stitch reveal hidden-run hidden.truth.json --json")
-        before, after = (
-            1e3 * self.read(f"{run}/result.json")["heldout_rms"] for run in ("hidden-before", "hidden-run")
-        )
+        runs = (self.read(f"{run}/result.json") for run in ("hidden-before", "hidden-run"))
+        before, after = (1e3 * run["heldout_rms"] for run in runs)
         named = ", ".join(revealed["in_the_model"] or revealed["named"])
         return f"named {named}; held-out {before:.0f} → {after:.0f} µm"
 
@@ -122,10 +115,7 @@ class Room:
         solved = self.json(f"{command} --json")
         truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
         truth[:3, 3] = [4.0, -1.0, 1.0]
-        least_squares, projection = (
-            off(solved["T_base1_base2"], truth),
-            off(solved["projection"]["T_base1_base2"], truth),
-        )
+        least_squares, projection = (off(by["T_base1_base2"], truth) for by in (solved, solved["projection"]))
         return "least squares {:.5f} rad, {:.5f} m; projection {:.5f} rad, {:.5f} m".format(*least_squares, *projection)
 
     def other_planes(self, command: str) -> str:
@@ -181,9 +171,7 @@ class Room:
 
     def plate(self, command: str) -> str:
         plate = self.json(command)["plate"]
-        return (
-            f"h {plate['height']:.2f} mm, {plate['stated']:.2f} stated; parallel within {plate['parallelism']:.2f} mm"
-        )
+        return "h {height:.2f} mm, {stated:.2f} stated; parallel within {parallelism:.2f} mm".format(**plate)
 
     def drill_camera(self, command: str) -> str:
         truth = self.read("drilling.truth.json")["hidden"]
