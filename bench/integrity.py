@@ -43,7 +43,7 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 MOUNTS = {"eye_to_hand": "blade", "eye_in_hand": "blade-table"}
 VIEWS, RAYS = 14, 120
-_OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
+OTHER_MOUNT = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
 Change = Callable[[SessionData], SessionData]
 TEN_DEGREES = np.radians(10) * np.eye(6)[2]  # of the third joint
 # Effects that a model may lack while a session is good: they must not cost it a view.
@@ -127,11 +127,7 @@ def moved_clouds(order: dict[int, int]) -> Change:
 def turned(change: Callable[[Rotation], Rotation]) -> Change:
     """Rotations of all poses rewritten."""
 
-    def apply(session: SessionData) -> SessionData:
-        T = poses_of(session)
-        return with_poses(session, frames.make(change(Rotation.from_matrix(T[:, :3, :3])).as_matrix(), T[:, :3, 3]))
-
-    return apply
+    return posed(lambda T: frames.make(change(Rotation.from_matrix(T[:, :3, :3])).as_matrix(), T[:, :3, 3]))
 
 
 def _torn(points: Array, shift: Array) -> Array:
@@ -140,8 +136,9 @@ def _torn(points: Array, shift: Array) -> Array:
     return points + later[:, None] * shift
 
 
-def _rows(order: Callable[[Array], Array]) -> Change:
-    return lambda session: with_poses(session, order(poses_of(session)))
+def posed(change: Callable[[Array], Array]) -> Change:
+    """Poses (V, 4, 4) changed, or in another order."""
+    return lambda session: with_poses(session, change(poses_of(session)))
 
 
 def _clouds(change: Callable[[Array], Array], views: Sequence[int] | None = None) -> Change:
@@ -206,11 +203,11 @@ def mistakes(views: int, rng: np.random.Generator) -> dict[str, Mistake]:
         "three shifted 1 mm": Mistake(displaced({a: shift(1.0), b: shift(-1.0), c: shift(1.0)}), one, (a, b, c)),
         "two exchanged": Mistake(moved_clouds({a: b, b: a}), ("exchanged",), (a, b)),
         "three exchanged": Mistake(moved_clouds({a: b, b: c, c: a}), ("exchanged",), (a, b, c)),
-        "shifted by 1": Mistake(_rows(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),
-        "shifted by -2": Mistake(_rows(lambda T: np.roll(T, -2, axis=0)), ("shifted",)),
-        "reversed": Mistake(_rows(lambda T: T[::-1]), ("reversed",)),
-        "inverse": Mistake(_rows(frames.inverse), ("inverse", "mount")),
-        "mount": Mistake(lambda s: replace(s, mount=_OTHER[s.mount]), ("mount", "inverse")),
+        "shifted by 1": Mistake(posed(lambda T: np.roll(T, 1, axis=0)), ("shifted",)),
+        "shifted by -2": Mistake(posed(lambda T: np.roll(T, -2, axis=0)), ("shifted",)),
+        "reversed": Mistake(posed(lambda T: T[::-1]), ("reversed",)),
+        "inverse": Mistake(posed(frames.inverse), ("inverse", "mount")),
+        "mount": Mistake(lambda s: replace(s, mount=OTHER_MOUNT[s.mount]), ("mount", "inverse")),
         "euler ZYX as xyz": Mistake(turned(lambda R: Rotation.from_euler("xyz", R.as_euler("ZYX"))), ("euler",)),
         "euler XYZ as ZYX": Mistake(turned(lambda R: Rotation.from_euler("ZYX", R.as_euler("XYZ"))), ("euler",)),
         "euler xyz as XYZ": Mistake(turned(lambda R: Rotation.from_euler("XYZ", R.as_euler("xyz"))), ("euler",)),
@@ -220,8 +217,8 @@ def mistakes(views: int, rng: np.random.Generator) -> dict[str, Mistake]:
             turned(lambda R: Rotation.from_quat(R.as_quat()[:, [3, 0, 1, 2]])), ("quaternion",)
         ),
         "quaternion conjugate": Mistake(turned(lambda R: R.inv()), ("quaternion",)),
-        "poses in inches": Mistake(_rows(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 25.4)), ("unit",)),
-        "poses in m": Mistake(_rows(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 1000)), ("unit",)),
+        "poses in inches": Mistake(posed(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 25.4)), ("unit",)),
+        "poses in m": Mistake(posed(lambda T: frames.make(T[:, :3, :3], T[:, :3, 3] / 1000)), ("unit",)),
         "clouds scaled 1.0254": Mistake(_clouds(lambda p: p * 1.0254), ("scale",)),
         "clouds mirrored": Mistake(_clouds(lambda p: p * [-1, 1, 1]), ("mirrored",)),
         "one scaled 1.0254": Mistake(_clouds(lambda p: p * 1.0254, [a]), ("scale",), (a,)),
@@ -234,7 +231,7 @@ def mistakes(views: int, rng: np.random.Generator) -> dict[str, Mistake]:
         "one torn 5 mm": Mistake(_clouds(lambda p: _torn(p, 5 * u), [a]), one, (a,)),
         "copy of a scan": Mistake(moved_clouds({a: b}), ("duplicate_scan",), (a,)),
         "copy of a pose": Mistake(
-            _rows(lambda T: np.concatenate([T[:a], T[b : b + 1], T[a + 1 :]])), ("duplicate_pose", "joint_row"), (a,)
+            posed(lambda T: np.concatenate([T[:a], T[b : b + 1], T[a + 1 :]])), ("duplicate_pose", "joint_row"), (a,)
         ),
         "neighbour's joints": Mistake(_joints(lambda s: np.array(s.views[next_row].joints), a), pose[1:], (a,)),
         "digit of a joint": Mistake(_joints(lambda s: s.views[a].joints + TEN_DEGREES, a), pose, (a,)),

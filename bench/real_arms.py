@@ -20,6 +20,7 @@ from bench.harness import SHARED_DATA, Row, Table, grouped, markdown, share
 from stitch import NoResultError, run
 from stitch.api.stepwise import suggest
 from stitch.model.model_toml import arm_model
+from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.result_document import model_of
 from stitch.screening.deep_check import deep_check
@@ -49,9 +50,7 @@ _BALLS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0]
 
 def pose(rotation_vector: Array, shift: Array) -> Array:
     """Return (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotation_vector).as_matrix(), shift
-    return T
+    return frames.make(Rotation.from_rotvec(rotation_vector).as_matrix(), shift)
 
 
 def labelled_session(poses: list[Array], seen: list[Array], mount: Mount) -> SessionData:

@@ -1,7 +1,7 @@
 """A view with stock on it, or displaced by as much: what `stitch run` says, and where it puts the view.
 
 A blade is scanned in a cell of the simulator (`data_synth`), in which one view sees the part before stock was ground
-off: all of it, or a half or a third along the blade (`casting.with_stock`). In as many cells the pose of one view is
+off: all of it, or a half or a third along the blade (`blade_with_stock`). In as many cells the pose of one view is
 wrong by as much, shifted in any direction or turned so that the part moves by that. Sessions are written as folders
 and run by the command; what it found is read from result.json.
 """
@@ -12,15 +12,11 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from unittest.mock import patch
 
 import numpy as np
 
 from bench.harness import Row, Table, grouped, markdown, share, stitch_process, with_all
-from data_synth.fixtures import quiet_scenes
-from data_synth.fixtures.blade_cells import captured, measured_blade
-from data_synth.scene import Scene
-from data_synth.shapes.casting import with_stock
+from data_synth.fixtures.blade_cells import blade_with_stock, captured, measured_blade
 from data_synth.simulate import Measured
 from data_synth.write import write_session
 from stitch.fusion.register import METHODS, register
@@ -50,25 +46,14 @@ def cell(job: Row) -> tuple[Measured, int]:
     rng = np.random.default_rng([job["seed"], 67])
     view = int(rng.integers(VIEWS))
     settings = {"views": VIEWS, "mount": job["mount"], "pixels": PIXELS}
-    measured = measured_blade(job["seed"], **settings)
     if job["kind"] == "stock":
-        mesh_for = quiet_scenes.mesh_for
         from_top = bool(rng.integers(2))
 
-        def grown(scene: Scene) -> object:
-            mesh = mesh_for(scene)
-            axis = int(np.argmax(mesh.extents))
+        def stock(along: Array) -> Array:
+            return job["size"] * ((1 - along if from_top else along) <= PARTS[job["part"]])
 
-            def stock(places: Array) -> Array:
-                along = (places[:, axis] - mesh.bounds[0, axis]) / mesh.extents[axis]
-                along = 1 - along if from_top else along
-                return job["size"] * (along <= PARTS[job["part"]])
-
-            return with_stock(mesh, stock)
-
-        with patch("data_synth.fixtures.quiet_scenes.mesh_for", grown):
-            raised = measured_blade(job["seed"], **settings).clouds[view]
-        return replace(measured, clouds=[raised if v == view else c for v, c in enumerate(measured.clouds)]), view
+        return blade_with_stock(job["seed"], [view], stock, **settings), view
+    measured = measured_blade(job["seed"], **settings)
     direction = rng.standard_normal(3)
     direction *= job["size"] / np.linalg.norm(direction)
     T = np.array(measured.T_base_flange)

@@ -54,13 +54,13 @@ class TrueAxis:
             tilt = swing * self.faults.get("axis_wobble", np.zeros(2)) @ across
             shift = swing * self.faults.get("axis_eccentricity", np.zeros(2)) @ across
             R = Rotation.from_rotvec(tilt).as_matrix() @ Rotation.from_rotvec(q * self.direction).as_matrix()
-            return _pose(R, self.point + shift - R @ self.point)
+            return pose_of(R, self.point + shift - R @ self.point)
         q = q * (1 + self.faults.get("axis_scale", np.zeros(1))[0])
         bend = self.faults.get("axis_pitch", np.zeros(3)) / 1e3
         # Along an arc of small steps: each goes where the carriage then looks.
         T = np.eye(4)
         for _ in range(200):
-            T = T @ _pose(Rotation.from_rotvec(bend * q / 200).as_matrix(), self.direction * q / 200)
+            T = T @ pose_of(Rotation.from_rotvec(bend * q / 200).as_matrix(), self.direction * q / 200)
         return T
 
 
@@ -113,9 +113,9 @@ def axis_cell(
     middle = np.asarray(mesh.bounds.mean(axis=0))
     turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix()
     place = np.array([950.0, 40.0, 400.0]) + rng.normal(0, 8.0, 3)
-    T_world_part = _pose(turned, place - turned @ middle + [0.0, 60.0 * ball, 0.0])
+    T_world_part = pose_of(turned, place - turned @ middle + [0.0, 60.0 * ball, 0.0])
     weights = field_map(scanner, rng)
-    T_mount = _pose(
+    T_mount = pose_of(
         Rotation.from_rotvec(rng.normal(0, 0.6, 3)).as_matrix(), np.array([40.0, -30.0, 110.0]) + rng.normal(0, 10, 3)
     )
     looks = [_view_of(place, kind, v, rng) for v in range(views)]
@@ -134,7 +134,7 @@ def axis_cell(
             # The arm is sent where it would look at the part if its rail were right.
             flange = np.linalg.inv(believed) @ looks[v] @ np.linalg.inv(T_mount)
             twist = rng.normal(0, _ARM_SCATTER)
-            off = _pose(Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:])
+            off = pose_of(Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:])
             T_world_scanner = carried["robot"] @ flange @ off @ T_mount
             flanges.append(flange)
         else:
@@ -212,7 +212,7 @@ def _view_of(place: Array, kind: str, v: int, rng: np.random.Generator) -> Array
     x = _unit(np.cross([0, 0, 1.0], z))
     R = np.column_stack([x, np.cross(z, x), z]) @ Rotation.from_rotvec([0, 0, rng.uniform(-0.8, 0.8)]).as_matrix()
     aim = place + rng.normal(0, 15.0, 3)
-    return _pose(R, aim + away * 420.0 * rng.uniform(0.93, 1.07))
+    return pose_of(R, aim + away * 420.0 * rng.uniform(0.93, 1.07))
 
 
 def _near(lean: Array, axis: int) -> Array:
@@ -224,7 +224,8 @@ def _unit(v: Array) -> Array:
     return np.asarray(v / np.linalg.norm(v))
 
 
-def _pose(R: Array, t: Array) -> Array:
+def pose_of(R: Array, t: Array) -> Array:
+    """Return (4, 4) of a rotation (3, 3) and a shift (3,)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T

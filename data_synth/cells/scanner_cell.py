@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from data_synth.cells.axis_cell import pose_of
 from data_synth.scanner import Cloud, Scanner, field_map
 from data_synth.scanning import scan
 from data_synth.shapes import build_shape
@@ -58,16 +59,16 @@ def scanner_cell(
     on_flange = np.array([0.0, 0.0, 120.0]) + rng.normal(0, 8.0, 3)
     in_cell = np.array([950.0, 40.0, 400.0]) + rng.normal(0, 8.0, 3)
     holds = on_flange if kind == "stands" else in_cell
-    T_holder_part = _pose(turned, holds - turned @ middle)
+    T_holder_part = pose_of(turned, holds - turned @ middle)
     T_mount = np.array([_mount(kind, k, in_cell, rng) for k in range(2)])
     flanges, clouds = np.zeros((2, views, 4, 4)), ([], [])
     for v in range(views):
-        off = _pose(Rotation.from_rotvec((twist := rng.normal(0, _ARM_SCATTER))[:3]).as_matrix(), twist[3:])
+        off = pose_of(Rotation.from_rotvec((twist := rng.normal(0, _ARM_SCATTER))[:3]).as_matrix(), twist[3:])
         look = _look(middle, rng)
         for k in range(2):
             if kind == "stands":
                 # Each scanner has stops of its own, at which the arm shows it the part from some side.
-                off = _pose(Rotation.from_rotvec((twist := rng.normal(0, _ARM_SCATTER))[:3]).as_matrix(), twist[3:])
+                off = pose_of(Rotation.from_rotvec((twist := rng.normal(0, _ARM_SCATTER))[:3]).as_matrix(), twist[3:])
                 look = _look(middle, rng)
                 flange = T_mount[k] @ np.linalg.inv(T_holder_part @ look)
                 T_part_scanner = np.linalg.inv(flange @ off @ T_holder_part) @ T_mount[k]
@@ -80,7 +81,7 @@ def scanner_cell(
             cloud = replace(cloud, points=cloud.points * scales[k])
             clouds[k].append(_erring(cloud, k, hidden or {}))
     stated = [
-        T @ _pose(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), rng.normal(0, 3.0, 3)) for T in T_mount
+        T @ pose_of(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), rng.normal(0, 3.0, 3)) for T in T_mount
     ]
     start = np.arange(views) * 30.0
     return ScannerCell(kind, flanges, clouds, T_mount, np.array(stated), np.array([start, start + 5.0]))
@@ -105,7 +106,7 @@ def _mount(kind: str, k: int, place: Array, rng: np.random.Generator) -> Array:
         # Side by side, turned inwards: they look at one spot.
         side = (2 * k - 1) * 110.0
         R = Rotation.from_rotvec([0, -np.arctan2(side, 420.0), 0]).as_matrix()
-        return _pose(
+        return pose_of(
             Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix() @ R,
             np.array([side, 30.0, 80.0]) + rng.normal(0, 5, 3),
         )
@@ -125,13 +126,7 @@ def _towards(aim: Array, away: Array, rng: np.random.Generator) -> Array:
     x = np.cross([0.3, 0.2, 1.0], -away)
     x = x / np.linalg.norm(x)
     R = np.column_stack([x, np.cross(-away, x), -away]) @ Rotation.from_rotvec([0, 0, rng.uniform(-2, 2)]).as_matrix()
-    return _pose(R, aim + away * 420.0 * rng.uniform(0.95, 1.05))
-
-
-def _pose(R: Array, t: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
+    return pose_of(R, aim + away * 420.0 * rng.uniform(0.95, 1.05))
 
 
 def write_scanners(folder: Path, cell: ScannerCell, stated: bool = True) -> list[Path]:

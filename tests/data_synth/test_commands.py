@@ -19,6 +19,7 @@ from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.cli import change, diagnose, run, terminal
 from stitch.errors import InputError, NoResultError
+from stitch.numerics import frames
 from stitch.session.reading.session_folder import load_session
 from tests.command_line import ended
 
@@ -259,13 +260,9 @@ HIDDEN = {"joint_compliance": {"c2": 1e-6, "c3": 2e-6}}
 
 
 def judged(tmp_path, hidden=HIDDEN, diagnosis=None, fitted=None, unit="mm", off=0.0) -> dict:
-    T = np.eye(4)
-    T[:3, 3] = [100.0, 0.0, 500.0]
-    found = T.copy()
-    found[0, 3] += off
     scale = 1.0 if unit == "mm" else 1e-3
-    stated = found.copy()
-    stated[:3, 3] *= scale
+    T = frames.make(np.eye(3), np.array([100.0, 0.0, 500.0]))
+    stated = frames.make(np.eye(3), scale * np.array([100.0 + off, 0.0, 500.0]))
     run = tmp_path / "run"
     run.mkdir(exist_ok=True)
     result = {

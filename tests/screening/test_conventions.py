@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.integrity import poses_of, with_poses
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.quiet_scenes import simulated, with_part
@@ -18,7 +19,7 @@ from stitch.screening.hypotheses import hypotheses, scale_text
 from stitch.screening.motions import RelativeScans
 from stitch.screening.target_checks import check_targets
 from stitch.session.robot import forward
-from tests.screening.mistakes import MISTAKES, with_poses
+from tests.screening.mistakes import MISTAKES
 
 JOINTS = {
     "j2 counts the other way": lambda q: q * [1, -1, 1, 1, 1, 1],
@@ -41,7 +42,7 @@ def motions(session, T_mount, seed=0):
 
 def cell_of(mount):
     session, T_mount, _ = labelled_cell(seed=4, views=10, mount=mount)
-    return with_poses(session, np.array([v.T_base_flange for v in session.views])), T_mount
+    return with_poses(session, poses_of(session)), T_mount
 
 
 @pytest.fixture(scope="module")

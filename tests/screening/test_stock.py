@@ -2,17 +2,14 @@
 
 import json
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import stitch
 from data_synth import kinematics
-from data_synth.fixtures import quiet_scenes
-from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.blade_cells import blade_with_stock, measured_blade
 from data_synth.fixtures.in_memory import session_of
-from data_synth.shapes.casting import with_stock
 from data_synth.write import write_session
 from stitch.api.pipeline import run
 from stitch.numerics import frames
@@ -22,26 +19,10 @@ CELL = {"seed": 2, "views": 10, "pixels": 80}
 VIEW = 8
 
 
-def with_casting(size, share):
-    """The cell in which one view saw so much stock on a share of the blade, from its foot on."""
-    mesh_for = quiet_scenes.mesh_for
-
-    def grown(scene):
-        mesh = mesh_for(scene)
-        axis = int(np.argmax(mesh.extents))
-        lowest = mesh.bounds[0, axis]
-        return with_stock(mesh, lambda places: size * (places[:, axis] <= lowest + share * mesh.extents[axis]))
-
-    measured = measured_blade(**CELL)
-    with patch("data_synth.fixtures.quiet_scenes.mesh_for", grown):
-        raised = measured_blade(**CELL).clouds[VIEW]
-    return replace(measured, clouds=[raised if v == VIEW else cloud for v, cloud in enumerate(measured.clouds)])
-
-
 @pytest.mark.usefixtures("no_drawing")
 def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     """It is taken off where it is; a run that was saved knows it again. The pose is as near the truth as is stated."""
-    measured = with_casting(0.2, 0.5)
+    measured = blade_with_stock(odd=[VIEW], stock=lambda along: 0.2 * (along <= 0.5), **CELL)
     write_session(tmp_path / "session", measured, "blade")
     found = stitch.run(stitch.load_session(tmp_path / "session"))
     (scan,) = (scan for scan in found.measurement.capture.scans if scan.stock is not None)
@@ -91,15 +72,7 @@ def test_a_clean_session_has_no_stock():
 
 def test_where_more_than_a_third_of_the_views_stand_off_nothing_is_taken_off():
     """No other says what their surface is: the scans stay as they were measured."""
-    clean = measured_blade(**CELL)
-    mesh_for = quiet_scenes.mesh_for
-    with patch(
-        "data_synth.fixtures.quiet_scenes.mesh_for",
-        lambda scene: with_stock(mesh_for(scene), lambda p: 0.15 + 0 * p[:, 0]),
-    ):
-        grown = measured_blade(**CELL).clouds
-    clouds = [grown[v] if v in (1, 3, 5, 8) else cloud for v, cloud in enumerate(clean.clouds)]
-    session = session_of(replace(clean, clouds=clouds))
+    session = session_of(blade_with_stock(odd=(1, 3, 5, 8), stock=lambda along: 0.15 + 0 * along, **CELL))
     found = run(session)
     assert found.doubts == ()
     for scan, untouched in zip(found.measurement.capture.scans, prepare_capture(session).scans, strict=True):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.run_folders import bare_run
 from stitch.errors import InputError
+from stitch.numerics import frames
 from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run
 from tests.command_line import ended
 
@@ -21,9 +22,7 @@ COVARIANCE[0, 4] = COVARIANCE[4, 0] = 0.5 * 1e-4 * 0.05
 
 def pose(rotation, xyz=(61.5, -22.25, 140.125)):
     """mm"""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation.as_matrix(), xyz
-    return T
+    return frames.make(rotation.as_matrix(), np.array(xyz))
 
 
 # One anywhere, one where KUKA's and FANUC's angles lock, one at half a turn.

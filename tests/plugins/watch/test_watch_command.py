@@ -155,9 +155,8 @@ def test_the_twist_of_the_mount_is_its_motion_about_the_part():
     first[:3, 3] = [1200.0, -50.0, 700.0]
     place = first[:3, :3] @ middle + first[:3, 3]
     turn, shift = np.array([1e-4, -2e-4, 3e-4]), np.array([0.05, -0.02, 0.01])
-    motion = np.eye(4)
-    motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    motion[:3, 3] = place + shift - motion[:3, :3] @ place
+    R = Rotation.from_rotvec(turn).as_matrix()
+    motion = frames.make(R, place + shift - R @ place)
     found = mount_twist(motion @ first, first, middle)
     np.testing.assert_allclose(found, [*turn, *shift], rtol=1e-3, atol=1e-8)
     # A turn about the scanner's own origin alone moves the part by its lever.

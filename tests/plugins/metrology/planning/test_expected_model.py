@@ -15,6 +15,7 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.diagnosis.candidates import candidates_of
 from stitch.errors import InputError, NoResultError
 from stitch.model.model import Model
+from stitch.numerics import frames
 from stitch.plugins.metrology.planning.detection_chances import ExpectedDiagnosis
 from stitch.plugins.metrology.planning.expected_model import (
     CellModel,
@@ -92,9 +93,7 @@ def planned(request):
 
 
 def _matrix(x):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:]
-    return T
+    return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
 
 
 def _six(T, scale):
