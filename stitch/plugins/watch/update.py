@@ -7,6 +7,7 @@ to the swing of the day; the hour spans what nobody has a thermometer for.
 
 import hashlib
 import io
+import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
-from stitch.plugins.watch.cell_identity import cell_identity, other_cell
+from stitch.numerics.units import METRES
 from stitch.plugins.watch.control_charts import Charts
 from stitch.plugins.watch.history import (
     TWIST_NAMES,
@@ -57,6 +58,10 @@ _RECENT = 640
 # One false alarm of the whole cell in so many sessions where nothing happens: two hundred months of 600, so that one in
 # a hundred remains where parameters follow temperatures in ways that the regressors do not quite have.
 RUN_LENGTH = 120_000.0
+# By what a cell is known again: names of arm and scanner, and the arm's DH rows. A calibrated arm differs from its data
+# sheet by less than this (mm, degrees); another arm by more in some row.
+_DH_ROW = ("a", "alpha_deg", "d", "theta_deg")
+_ARM_LENGTH, _ARM_ANGLE = 10.0, 2.0
 
 
 def chosen_channels(covariates: Iterable[str]) -> list[str]:
@@ -295,6 +300,34 @@ def _store_run(history: History, record: RunRecord) -> float | None:
     if _update_channels(history, record):
         return -np.inf
     return begun
+
+
+def cell_identity(session: Path) -> dict[str, Any]:
+    """Return what session.toml states of arm and scanner; {} where there is none, or where it states nothing."""
+    try:
+        document = tomllib.loads((session / "session.toml").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    robot, scanner = document.get("robot", {}), document.get("scanner", {})
+    rows = [[float(joint.get(key, 0.0)) for key in _DH_ROW] for joint in robot.get("joints", [])]
+    stated = {"arm": robot.get("name"), "scanner": scanner.get("name"), "rows": rows}
+    return {key: value for key, value in stated.items() if value}
+
+
+def other_cell(known: dict[str, Any], told: dict[str, Any], length_unit: str) -> str | None:
+    """Return by what a session is of another cell, in words; None where both could be one."""
+    for key in ("arm", "scanner"):
+        if key in known and key in told and known[key] != told[key]:
+            return f"has {key} {told[key]}, the cell {known[key]}"
+    if "rows" in known and "rows" in told:
+        if len(known["rows"]) != len(told["rows"]):
+            return f"has an arm of {len(told['rows'])} joints, the cell one of {len(known['rows'])}"
+        in_mm = METRES.get(length_unit, 1e-3) * 1e3
+        limits = np.array([_ARM_LENGTH / in_mm, _ARM_ANGLE, _ARM_LENGTH / in_mm, _ARM_ANGLE])
+        off = np.abs(np.array(told["rows"]) - np.array(known["rows"])) / limits
+        if off.max() > 1:
+            return f"has other DH rows than the cell (joint {int(off.max(axis=1).argmax()) + 1} first of all)"
+    return None
 
 
 def _begin_cell(history: History, record: RunRecord) -> None:

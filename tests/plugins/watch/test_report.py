@@ -23,7 +23,6 @@ from data_synth.fixtures.cell_records import records_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.write import robot_table
-from stitch.plugins.watch.cell_identity import cell_identity, other_cell
 from stitch.plugins.watch.control_charts import (
     CUSUM_REFERENCES,
     EWMA_WEIGHT,
@@ -39,7 +38,7 @@ from stitch.plugins.watch.control_charts import (
 from stitch.plugins.watch.exported import dfq_text, openmetrics
 from stitch.plugins.watch.history import open_history
 from stitch.plugins.watch.report import cell_report, cell_trend, headline
-from stitch.plugins.watch.update import append_runs
+from stitch.plugins.watch.update import append_runs, cell_identity, other_cell
 from tests.command_line import ended
 from viz.watch.cell_page import light
 
