@@ -1,6 +1,6 @@
 """A table of poses or joint angles -> the text of views.csv; no scans to ask: what the file does not say, flags say."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.output.session_files import pose_columns, table_text
+from stitch.output.session_files import TableColumns, pose_columns, table_text
 from stitch.plugins.intake.column_names import bare_name, read_names
 from stitch.plugins.intake.controllers.program import ImportedTable, import_file, numbered_names
 from stitch.plugins.intake.layouts import POSE_UNITS, covariate_columns, pose_units, possible_layouts
@@ -74,10 +74,10 @@ def _import_measured(file: Path, raw: RawPoses, unit: str) -> ImportedTable:
             raise InputError(f"{file} row {odd + 1}: quaternion of length {size[odd]:.5g}; to fix: write a unit one")
         angles = "xyz-extrinsic" if layout.rotation.shape[1] == 3 else None
         T = readings(layout, angles, layout.angle_unit)[0].T
-        columns: dict[str, Sequence[object]] = {"view": numbered_names(names), **_listed(pose_columns(T))}
+        columns: TableColumns = {"view": numbered_names(names), **pose_columns(T)}
         return ImportedTable("frames.csv", table_text(columns), len(T), _OF_TRACKERS, ())
     views = [f"v{names[: i + 1].count(name)}" for i, name in enumerate(names)]
-    columns = {"view": views, "target": names, **_listed(dict(zip("xyz", position.T, strict=True)))}
+    columns = {"view": views, "target": names, **dict(zip("xyz", position.T, strict=True))}
     note = (
         "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
     )
@@ -96,7 +96,7 @@ def import_table(file: Path, raw: RawPoses, unit: str, stated: StatedTable) -> I
         ways = "; or ".join(layout.words for layout in layouts)
         raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
     layout = layouts[0]
-    columns: dict[str, Sequence[object]] = {"view": _view_names(raw)}
+    columns: dict[str, Sequence[object] | Array] = {"view": _view_names(raw)}
     count, words = len(columns["view"]), []
     if (clouds := _cloud_names(raw)) is not None:
         columns["cloud"] = clouds
@@ -118,7 +118,7 @@ def import_table(file: Path, raw: RawPoses, unit: str, stated: StatedTable) -> I
         file_unit = _only(file, "the unit of its positions", lengths, "state --file-unit")
         T = frames.inverse(reading.T) if stated.inverse else reading.T
         scale = POSE_UNITS[file_unit] / METRES[unit]
-        columns |= _listed(pose_columns(frames.make(T[:, :3, :3], T[:, :3, 3] * scale)))
+        columns |= pose_columns(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
         )
@@ -126,10 +126,6 @@ def import_table(file: Path, raw: RawPoses, unit: str, stated: StatedTable) -> I
     # How times of day were read, or why they are left out.
     warnings = (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
     return ImportedTable("views.csv", table_text(columns), count, "; ".join(words), warnings)
-
-
-def _listed(columns: Mapping[str, Array]) -> dict[str, list[object]]:
-    return {name: list(values) for name, values in columns.items()}
 
 
 def _view_names(raw: RawPoses) -> list[str]:

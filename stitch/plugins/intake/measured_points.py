@@ -19,7 +19,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
-from stitch.output.session_files import pose_columns, table_text
+from stitch.output.session_files import TableColumns, pose_columns, table_text
 from stitch.plugins.intake.cloud_pairs import LACKING, Pairing, pairings
 from stitch.plugins.intake.controllers.program import numbered_names
 from stitch.plugins.intake.first_session import bare_session
@@ -448,15 +448,17 @@ def write_measured(folder: Path, made: MeasuredSession, *, force: bool = False) 
     write_texts(folder, {"views.csv": table_text(views), shown: seen, "session.toml": _toml(folder, made)})
 
 
-def _views_columns(made: MeasuredSession, order: Sequence[int], rows: Sequence[int]) -> dict[str, Sequence[object]]:
+def _views_columns(
+    made: MeasuredSession, order: Sequence[int], rows: Sequence[int]
+) -> dict[str, Sequence[object] | Array]:
     """views.csv, mm: names, joints or poses, times, and what stands beside them."""
     reading, raw = made.way.reading, made.poses.raw
     named = [made.seen.views[v] or next(iter(raw.labels[row]), "") for v, row in zip(order, rows, strict=True)]
     plain = [re.sub(r"[^\w.+-]+", "-", name).strip("-") or f"p{i + 1:03d}" for i, name in enumerate(named)]
-    out: dict[str, Sequence[object]] = {"view": numbered_names(plain)}
+    out: dict[str, Sequence[object] | Array] = {"view": numbered_names(plain)}
     out |= joint_columns(reading, rows)
     if reading.rotation != JOINT_ANGLES:
-        out |= {name: list(values) for name, values in pose_columns(made.way.T[rows]).items()}
+        out |= pose_columns(made.way.T[rows])
     out |= covariate_columns(reading.layout, rows, raw.time_s)
     times = made.found[0].table.times
     if "time_s" not in out and times is not None and made.seen.rows:
@@ -466,17 +468,18 @@ def _views_columns(made: MeasuredSession, order: Sequence[int], rows: Sequence[i
     return out
 
 
-def _file_columns(made: MeasuredSession, order: Sequence[int], names: Sequence[str]) -> dict[str, Sequence[object]]:
+def _file_columns(made: MeasuredSession, order: Sequence[int], names: Sequence[str]) -> TableColumns:
     """points.csv or frames.csv, mm; sigma where one is stated."""
     seen = [_sighting(made.seen, made.way, v) for v in order]
     places, sigma = np.concatenate([s.points for s in seen]), np.concatenate([s.sigma for s in seen])
     views = [name for name, s in zip(names, seen, strict=True) for _ in s.targets]
     stated = {} if np.isnan(sigma).all() else {"sigma": ["" if np.isnan(x) else f"{x:.6g}" for x in sigma]}
+    shown: TableColumns
     if made.way.turn is None:
-        shown = {"target": [target for s in seen for target in s.targets]} | dict(zip("xyz", places.T, strict=True))
+        shown = {"target": [target for s in seen for target in s.targets], **dict(zip("xyz", places.T, strict=True))}
     else:
         shown = pose_columns(frames.make(np.array([s.rotation for s in seen]), places))
-    return {"view": views} | {key: list(values) for key, values in shown.items()} | stated
+    return {"view": views, **shown, **stated}
 
 
 def _toml(folder: Path, made: MeasuredSession) -> str:
