@@ -66,7 +66,6 @@ class Candidate:
 
     effect: Effect
     forms: tuple[Form, ...]
-    response: Array  # (·, P) of the first form
     points: PointSums | None  # of the first form, where the effect changes points
 
     @property
@@ -125,7 +124,7 @@ def candidate_as_fitted(linear: LinearModel, term: Term) -> Candidate:
     keep = ~term.gridded & (term.values != 0)
     response = linear.responses([zero])[0].columns
     form = Form(zero, keep, response, linear.reduce(response), term.typical[keep])
-    return Candidate(term.effect, (form,), response, None)
+    return Candidate(term.effect, (form,), None)
 
 
 def free_masks(term: Term) -> list[Mask]:
@@ -160,4 +159,4 @@ def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequ
         forms += [Form(term, keep, response.columns, reduced, term.typical[keep]) for keep in free_masks(term)]
     if not forms:
         return None
-    return Candidate(terms[0].effect, tuple(forms), responses[0].columns, responses[0].points)
+    return Candidate(terms[0].effect, tuple(forms), responses[0].points)

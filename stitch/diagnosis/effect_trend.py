@@ -5,56 +5,42 @@ one direction, with the standard deviation of what is independent between views.
 is drawn. The direction and the axis are those of the candidate that is named first: the turn of one joint where the
 effect is in a joint, the fitted twist of the mount, else the direction in which the effect displaces the views most.
 A candidate's line is by how much it moves what the model predicts for these views, hand-eye and effects in use fitted
-anew beside it, with its standard deviation. Effects of points are read along the rays, in bins of points.
+anew beside it, with its standard deviation. Effects of points have bins of points in place of views (`point_trend`).
 """
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from stitch.diagnosis.candidate_views import candidate_measurement
-from stitch.diagnosis.candidates import Form, candidate_as_fitted
+from stitch.diagnosis.candidates import candidate_as_fitted
 from stitch.diagnosis.deciding_view import model_beside, predict_views
 from stitch.diagnosis.dependence import Dependence
+from stitch.diagnosis.fitted_effect import Change, EffectTrend, FittedEffect, fit_change, fit_effect
+from stitch.diagnosis.point_trend import trends_of_points
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects
-from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, by_joint, parameters_in, twist
-from stitch.model.forward import moves_points, point_correction, pose_derivatives, scan_points
+from stitch.model.forward import moves_points, pose_derivatives
 from stitch.model.model import Model, Term
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Indices, Mask
-from stitch.numerics.least_squares import fit_columns
-from stitch.numerics.reml import NOISE, at_variances
+from stitch.numerics.frames import Array
+from stitch.numerics.reml import NOISE
 from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import JOINT_SCATTER
-from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
+from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.session.capture import build_capture
-from stitch.session.measurement import Measurement, ScanView, Views
+from stitch.session.measurement import Measurement, Views
+from stitch.session.scan import even_indices
 
 # Dots along one trend: more cannot be told apart.
 _MOST_DOTS = 300
-# Bins of the points of effects of the scanner and of the part's shape.
-_BINS = 16
-# Correspondences at the most that one trend takes.
-_MOST_CORRESPONDENCES = 60_000
-_TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
-# What effects of points live on, with its unit, None for the session's; all others the angle in the field.
-_POINT_AXES = {
-    "range_scale": ("distance from the scanner", None),
-    "range_nonlinearity": ("distance from the scanner", None),
-    "incidence_bias": ("angle of incidence", "°"),
-    "intensity_bias": ("intensity, in standard deviations", ""),
-    "part_sag": ("height above the clamp", None),
-}
 # What else moves as a whole, by the place of its effects.
 _BODIES = {"part": "the part", "base": "the robot's base", "axis": "the external axis"}
 _CONSTANT = Effect(
@@ -71,30 +57,6 @@ _CONSTANT = Effect(
 _Axis = tuple[str, str, Array]
 
 
-@dataclass(frozen=True)
-class EffectTrend:
-    """D dots, each what the model leaves of a view, with the line of one effect over them."""
-
-    follows: str  # the horizontal axis: view order, time_s, angle of joint 2, …
-    unit: str  # of `at`: "", s, °, N m, °C, length_unit
-    of: str  # what is off by the vertical axis: the part, the mount, joint 2, …
-    value_unit: str  # of the vertical axis: rad, or length_unit
-    at: Array  # (D,) horizontal
-    views: Indices  # (D,) number of the view of each dot; empty where dots are bins of points
-    measured: Array  # (D,) vertical, with no candidate in the model
-    sigma: Array  # (D,) standard deviation of a dot, by what is independent between views
-    predicted: Array  # (D,) the line: by how much the effect moves what the model predicts
-    predicted_sigma: Array  # (D,) standard deviation of the line
-    moves: str  # what the effect itself moves: `of`, unless another effect chose the axes
-    effect: Array  # (D,) what it does there itself, before hand-eye and effects in use adapt to it
-    after: Array | None = None  # (D,) the dots with the effect in the model, where it is in it
-
-    def with_dots(self, dots: Indices) -> "EffectTrend":
-        """Return the trend with some of its dots, by their indices."""
-        arrays: dict[str, Any] = {name: x[dots] for name, x in vars(self).items() if isinstance(x, np.ndarray)}
-        return replace(self, **arrays)
-
-
 def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
     """Return the trends of candidates, by name: one set of dots, whose axes the first candidate chooses, a line each.
 
@@ -107,9 +69,9 @@ def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[s
     pairs = [(scored, again) for scored, again in zip(given, refitted, strict=True) if again.fitted]
     if not pairs:
         return {}
-    effects = [_fit_effect(fitted, scored, again) for scored, again in pairs]
+    effects = [fit_effect(fitted, scored, again) for scored, again in pairs]
     if moves_points([effects[0].term]):
-        return _trends_of_points(fitted, effects, [again for _, again in pairs])
+        return trends_of_points(fitted, effects, [again for _, again in pairs])
     plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_axes(fitted, effects[0]))
     return {} if plot is None else {effect.term.name: _trend_in_plot(plot, effect) for effect in effects}
 
@@ -140,7 +102,7 @@ def expected_in_view(
     anew = score(fitted, rivals[0].candidate)
     if surfaces is None or not anew.fitted or moves_points([scored.form.term for scored in rivals]):
         return None
-    effect = _fit_effect(fitted, rivals[0], anew)
+    effect = fit_effect(fitted, rivals[0], anew)
     motion, (follows, _, _) = _axes(fitted, effect)
     if "gravity" in follows:
         return None
@@ -159,7 +121,7 @@ def expected_in_view(
     without = fitted.baseline_trial.solve()
     expected = {}
     for scored, prediction in zip(rivals, predict_views(linear, rivals, joints[None], np.array([wait])), strict=True):
-        mean, covariance = prediction.of([], np.zeros(1, np.int64))
+        mean, covariance = prediction.of_sets([], np.zeros(1, np.int64))
         value = projection @ (mean[0] - prediction.design[0] @ without)
         expected[scored.name] = (float(value), float(np.sqrt(projection @ covariance[0] @ projection)))
     scatter = _view_scatter(linear, rivals[0], measurement)
@@ -215,7 +177,7 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     # Observations are residuals from the model, which has the effect: its share is added back.
     observed = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
     without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=observed))
-    effect = _Effect(term, form, _change(without, form.columns, without))
+    effect = FittedEffect(term, form, fit_change(without, form.columns, without))
     axes = _axes(without, _clearest_joint(effect))
     plot = _plot(without, linear, *axes)
     with_effect = _plot(replace(fitted, design=np.hstack([without.design, form.response])), linear, *axes)
@@ -224,7 +186,7 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     return _trend_in_plot(replace(plot, after=with_effect.measured), effect)
 
 
-def _clearest_joint(effect: "_Effect") -> "_Effect":
+def _clearest_joint(effect: FittedEffect) -> FittedEffect:
     """Return an effect of several joints reduced to the joint that differs most from zero; any other as it is.
 
     The measure is vᵀ C⁻¹ v, with values v of that joint's free parameters and their covariance C.
@@ -291,7 +253,7 @@ def _trend_of_joint(
     per_unit = _displacements(fitted, turned)[..., 0]
     motion = _Motion(f"joint {number}", "rad", per_unit, error[:, None] * per_unit, number - 1)
     plot = _plot(fitted, scatter, motion, axis)
-    change = _change(fitted, fitted.reduce(response), fitted)
+    change = fit_change(fitted, fitted.reduce(response), fitted)
     return None if plot is None else plot.trend(change, motion.of, shapes @ change.values)
 
 
@@ -316,12 +278,7 @@ def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTr
         moves="the views",
         effect=predicted,
     )
-    return trend.with_dots(_drawn_views(len(predicted)))
-
-
-def _drawn_views(views: int) -> Indices:
-    """Return the indices of the views that get a dot: at most `_MOST_DOTS`, evenly chosen."""
-    return np.unique(np.linspace(0, views - 1, min(views, _MOST_DOTS)).astype(np.int64))
+    return trend.with_dots(even_indices(len(predicted), _MOST_DOTS))
 
 
 @dataclass(frozen=True)
@@ -340,55 +297,17 @@ class _Motion:
         """(V,) inner products of the effect's displacement with that of a unit."""
         return np.sum(self.per_unit * self.by_effect, axis=1)
 
+    @cached_property
+    def unit_square(self) -> Array:
+        """(V,) squared displacement by a unit of the motion; not less than 1 % of the median over the views.
 
-@dataclass(frozen=True)
-class _Change:
-    """What an effect changes in the model's prediction of the reduced observations."""
-
-    per_unit: Array  # (n, p) per unit of each parameter, hand-eye and effects in use fitted anew beside it
-    values: Array  # (p,) of the parameters
-    covariance: Array  # (p, p)
-
-
-def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change:
-    """Return the fit of further columns in a linear model: values, covariance, and what they change in its prediction.
-
-    Args:
-        columns: (n, p) reduced observations per unit of each parameter.
-        beside: the model with the variances that remain beside these columns, for the covariance.
-    """
-    white = linear.whiten(columns)
-    # How hand-eye and effects in use change by a unit of each column: they absorb a part of it.
-    absorbed = np.column_stack([fit_columns(linear.white_design, column) for column in white.T]).astype(float)
-    residual = beside.residual(columns)
-    values = fit_columns(linear.residual(columns), linear.white_residual)
-    covariance = np.linalg.pinv(residual.T @ residual).astype(float)
-    return _Change(columns - linear.reduce(linear.design) @ absorbed, values, covariance)
+        A view that a unit hardly moves would get a dot of noise.
+        """
+        square = np.sum(self.per_unit**2, axis=1)
+        return np.maximum(square, 1e-2 * np.median(square))
 
 
-@dataclass(frozen=True)
-class _Effect:
-    """An effect as these views fit it."""
-
-    term: Term  # with the fitted values
-    form: Form
-    change: _Change
-
-
-def _fit_effect(linear: LinearModel, scored: Score, in_linear: Score) -> _Effect:
-    """Return an effect with form and values of its score, as they are stated; their covariance is that in `linear`.
-
-    Args:
-        in_linear: the score of the same candidate in `linear`.
-    """
-    beside = (
-        linear if in_linear.variances is None else replace(linear, null=at_variances(linear.mixed, in_linear.variances))
-    )
-    change = replace(_change(linear, scored.form.columns, beside), values=scored.values)
-    return _Effect(scored.form.at(scored.values), scored.form, change)
-
-
-def _axes(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
+def _axes(linear: LinearModel, effect: FittedEffect) -> tuple[_Motion, _Axis]:
     """Return the vertical axis of an effect's plot, a motion, and the horizontal one.
 
     The sign is chosen so that the largest displacement is positive; the turn of a joint keeps its own sign.
@@ -401,11 +320,10 @@ def _axes(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
     return motion, _axis(linear.measurement.views, effect.term, motion)
 
 
-def _trend_in_plot(plot: "_Plot", effect: _Effect) -> EffectTrend:
+def _trend_in_plot(plot: "_Plot", effect: FittedEffect) -> EffectTrend:
     """Return the trend of an effect over the dots of a plot whose axes another effect may have chosen."""
     motion = _motion(plot.linear, effect)
-    square = np.sum(motion.per_unit**2, axis=1)
-    amount = motion.products / np.maximum(square, 1e-2 * np.median(square))
+    amount = motion.products / motion.unit_square
     if effect.term.effect.place == "part":
         # Where the part sat at first is nobody's error.
         amount = amount - amount[np.argmin(plot.axis[2])]
@@ -423,21 +341,12 @@ class _Plot:
     sigma: Array  # (V,)
     after: Array | None = None  # (V,) with an effect in the model that the dots are without
 
-    @cached_property
-    def unit_square(self) -> Array:
-        """(V,) squared displacement by a unit of the motion; not less than 1 % of the median over the views.
-
-        A view that a unit hardly moves would get a dot of noise.
-        """
-        square = np.sum(self.motion.per_unit**2, axis=1)
-        return np.maximum(square, 1e-2 * np.median(square))
-
     def amounts(self, reduced: Array) -> Array:
         """Return by how many units of the motion (V, P) reduced observations (n, P) displace the views, per column."""
         moved = _displacements(self.linear, self.linear.observation.expand(reduced))
-        return np.einsum("vk,vkp->vp", self.motion.per_unit, moved) / self.unit_square[:, None]
+        return np.einsum("vk,vkp->vp", self.motion.per_unit, moved) / self.motion.unit_square[:, None]
 
-    def trend(self, change: _Change, moves: str, effect: Array) -> EffectTrend:
+    def trend(self, change: Change, moves: str, effect: Array) -> EffectTrend:
         """Return the trend of an effect: the dots, with the line that the model would predict with it, and its sigma.
 
         Args:
@@ -462,7 +371,7 @@ class _Plot:
             effect=effect,
             after=self.after,
         )
-        return trend.with_dots(_drawn_views(len(at)))
+        return trend.with_dots(even_indices(len(at), _MOST_DOTS))
 
 
 def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
@@ -498,7 +407,7 @@ def _independent_covariance(linear: LinearModel) -> Array:
     return covariance + 1e-12 * size[:, None, None] * np.eye(covariance.shape[1])
 
 
-def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
+def _motion(linear: LinearModel, effect: FittedEffect) -> _Motion:
     """Return the motion that is the vertical axis of an effect's plot, by the place where the effect acts.
 
     Effects of joints: the turn of the joint that moves the views most. Effects of the mount: its twist in the view that
@@ -604,175 +513,3 @@ def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
     if "velocity" in term.effect.needs and views.velocity is not None:
         return f"speed of joint {number}", "°/s", np.degrees(views.velocity[:, joint])
     return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
-
-
-def _trends_of_points(
-    linear: LinearModel, effects: Sequence[_Effect], scores: Sequence[Score]
-) -> dict[str, EffectTrend]:
-    """Return trends of effects that change points, by name: means over bins of points in place of dots of views.
-
-    A dot is the distance that the model leaves in a bin, divided by the cosine between the first effect's motion and
-    the normal. A line is the part of that which an effect explains. Its sigma is |line| / √W, with the Wald statistic
-    W = vᵀ C⁻¹ v of the effect's values v. Empty without clouds.
-
-    Args:
-        effects: fitted effects; the first chooses both axes.
-        scores: of these effects, in the same order.
-    """
-    surfaces = surfaces_of(linear)
-    left = predicted_distances(linear)
-    if surfaces is None or left is None:
-        return {}
-    term = effects[0].term
-    at, cosine, row, view_of = _points_of_matches(linear, surfaces, term, len(left))
-    bins = _bins(at, cosine)
-    if not bins:
-        return {}
-    views = linear.measurement.views
-    length = linear.measurement.length_unit
-    temperature = _TEMPERATURES.get(term.name)
-    unit: str | None
-    if temperature is not None:
-        follows, unit = (temperature, "°C") if temperature in views.covariates else ("time", "s")
-    else:
-        follows, unit = _POINT_AXES.get(term.name, ("angle from the middle of the field", "°"))
-    places = np.array([at[inside].mean() for inside in bins])
-    plots = [predicted_distances(linear, scored) for scored in scores]
-    if plots[0] is None:
-        return {}
-    sigma = _scatter(bins, cosine, plots[0][row], view_of)
-    trends = {}
-    for effect, remaining in zip(effects, plots, strict=True):
-        if remaining is None:
-            continue
-        predicted = _means(bins, cosine, (left - remaining)[row])
-        change = effect.change
-        wald = float(change.values @ np.linalg.pinv(change.covariance) @ change.values)
-        trends[effect.term.name] = EffectTrend(
-            follows=follows,
-            unit=length if unit is None else unit,
-            of=_owner(term),
-            value_unit=length,
-            at=places,
-            views=np.zeros(0, np.int64),
-            measured=_means(bins, cosine, left[row]),
-            sigma=sigma,
-            predicted=predicted,
-            predicted_sigma=np.abs(predicted) / np.sqrt(max(wald, 1e-300)),
-            moves=_owner(effect.term),
-            effect=predicted,
-        )
-    return trends
-
-
-def _owner(term: Term) -> str:
-    """Return what an effect of points belongs to."""
-    return "the part" if term.effect.place == "shape" else "the scanner"
-
-
-def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, count: int) -> list[Any]:
-    """Return four arrays (N,) on both points of at most `_MOST_CORRESPONDENCES` correspondences.
-
-    1. The value of what the effect depends on.
-    2. The cosine between the effect's motion and the normal, with the sign of the distance: first view less second.
-    3. The number of the correspondence.
-    4. The point's view.
-
-    Args:
-        count: number of all correspondences.
-    """
-    poses = surfaces.capture.poses(linear.model.T_mount)
-    matches = surfaces.unconstrained.overlaps.matches
-    step = max(count // _MOST_CORRESPONDENCES, 1)
-    rows = list[tuple[Any, ...]]()
-    start = 0
-    for m in matches:
-        some = np.arange(0, len(m.residual), step)
-        number = start + some
-        start += len(m.residual)
-        for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):
-            points, view = scan_points(linear.measurement, v, index)
-            direction = _directions(term, points, view, poses[v])
-            cosine = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
-            at = _driver_values(term.name, points, view, poses[v])
-            rows.append((at, sign * cosine, number, np.full(len(some), v)))
-    return [np.concatenate(column) for column in zip(*rows, strict=True)]
-
-
-def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array:
-    """Return unit vectors (N, 3) of the direction in which an effect moves points, scanner frame.
-
-    If more than 90 % of the squared motion lies along the rays, these are returned: their sign is the same everywhere.
-    """
-    moved = -point_correction([term], points, view, pose)
-    rays: Array = view.along(points)
-    along = np.einsum("ni,ni->n", moved, rays)
-    length = np.linalg.norm(moved, axis=1)
-    if np.sum(along**2) > 0.9 * np.sum(length**2):
-        return rays
-    return moved / np.maximum(length, 1e-300)[:, None]
-
-
-def _driver_values(name: str, points: Array, view: ScanView, pose: Array) -> Array:
-    """Return values (N,) of what an effect of points depends on: distance, angle (degrees), height, temperature …
-
-    Args:
-        name: of the effect; unknown ones get the angle from the middle of the field.
-        points: (N, 3), scanner frame.
-        view: what is known of the scan and its points.
-        pose: (4, 4) T_reference_scanner.
-    """
-    match name:
-        case "range_scale" | "range_nonlinearity":
-            return np.linalg.norm(view.away(points), axis=1)
-        case "incidence_bias":
-            return np.degrees(np.arccos(np.clip(view.cosine, 0, 1)))
-        case "intensity_bias":
-            assert view.intensity is not None
-            return view.intensity
-        case "part_sag":
-            return frames.transform(pose, points)[:, 2]
-        case "part_growth" | "scanner_thermal_scale":
-            at = view.views.covariates.get(_TEMPERATURES[name], view.views.time)
-            return np.full(len(points), float(at[view.index]))
-    return np.degrees(np.arctan(np.sqrt(view.rho2(points))))
-
-
-def _bins(at: Array, cosine: Array) -> list[Mask]:
-    """Return masks (N,) of bins of equal counts of points in which the effect can be seen; [] if all points are alike.
-
-    Args:
-        at: (N,) what the bins divide.
-        cosine: (N,) between the effect's motion and the normal.
-    """
-    edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
-    inside = [(at >= low) & (at <= high) for low, high in pairwise(edges)]
-    return [some for some in inside if np.sum(cosine[some] ** 2) > 0] if len(edges) > 2 else []
-
-
-def _means(bins: Sequence[Mask], cosine: Array, distances: Array) -> Array:
-    """Return the motion (D,) of each bin's points by least squares: Σ cosine · distance / Σ cosine².
-
-    Args:
-        bins: D masks (N,).
-        cosine: (N,) between the motion and the normal.
-        distances: (N,) along the normal, length_unit.
-    """
-    return np.array([np.sum(cosine[b] * distances[b]) / np.sum(cosine[b] ** 2) for b in bins])
-
-
-def _scatter(bins: Sequence[Mask], cosine: Array, remaining: Array, view_of: Indices) -> Array:
-    """Return the standard deviation (D,) of `_means`, views as the independent samples.
-
-    With t_v = Σ cosine · (distance − cosine · mean) over the points of view v, it is √(Σ t_v²) / Σ cosine².
-
-    Args:
-        remaining: (N,) distances that the effect leaves, length_unit.
-        view_of: (N,) view of each point.
-    """
-    sigma = []
-    for b, mean in zip(bins, _means(bins, cosine, remaining), strict=True):
-        products = np.bincount(view_of[b], (cosine * remaining)[b])
-        squares = np.bincount(view_of[b], cosine[b] ** 2)
-        sigma.append(np.sqrt(np.sum((products - mean * squares) ** 2)) / squares.sum())
-    return np.array(sigma)

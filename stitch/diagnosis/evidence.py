@@ -11,6 +11,7 @@ import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.law_ranking import laws_of_base
 from stitch.diagnosis.naming import (
     Case,
     Question,
@@ -33,7 +34,7 @@ from stitch.diagnosis.ranking import (
 )
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sensitivity import imitated_share
-from stitch.diagnosis.systematic_laws import dictionary_of, law_of, laws_of_base
+from stitch.diagnosis.systematic_laws import dictionary_of, law_of
 from stitch.diagnosis.validation import CrossValidation, cross_validate, objection_in_halves
 from stitch.diagnosis.verdict import Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
@@ -87,24 +88,22 @@ def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
         return None
     if len(evidence.named) != 1:
         return Reply("not asked of a group", {"left_out": left_out})
-    objections = list[str]()
-    for effect in effects:
-        objection = _objection(effect, left_out[effect.name])
-        if objection is None:
-            break
-        objections.append(objection)
-    else:
-        notes = (*evidence.notes, objections[0])
-        return Reply(objections[0], {"left_out": left_out, "refuted": True, "notes": notes})
-    if effect is effects[0]:
+    objection = _objection(effects[0], left_out[effects[0].name])
+    if objection is None:
         return Reply("yes", {"left_out": left_out})
-    second = alone[effect.name]
-    changes = {"left_out": left_out, "explanation": (second,), "further": None}
-    refuted = not is_certain(second)
-    if not refuted and (objection := _objection(second, cross_validate(case.linear, second.score))) is not None:
-        refuted = True
+    second = evidence.second
+    if second is None or _objection(second, left_out[second.name]) is not None:
+        notes = (*evidence.notes, objection)
+        return Reply(objection, {"left_out": left_out, "refuted": True, "notes": notes})
+    second = alone[second.name]
+    objections = [objection]
+    is_refuted = not is_certain(second)
+    if not is_refuted and (objection := _objection(second, cross_validate(case.linear, second.score))) is not None:
+        is_refuted = True
         objections.append(objection)
-    return Reply("; ".join(objections), {**changes, "refuted": refuted, "notes": (*evidence.notes, *objections)})
+    changes = {"explanation": (second,), "further": None, "refuted": is_refuted}
+    notes = (*evidence.notes, *objections)
+    return Reply("; ".join(objections), {**changes, "left_out": left_out, "notes": notes})
 
 
 def does_the_scanner_explain_it(case: Case, evidence: Evidence) -> Reply | None:
@@ -124,20 +123,18 @@ def does_the_scanner_explain_it(case: Case, evidence: Evidence) -> Reply | None:
 def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: does the effect that was proposed and then refuted hold beside a second effect?
 
-    A second effect that is not in the model can make the first look different in each half of the views, or look like
-    a smooth error of the scanner. Then the refuted effect is proposed again, with the second:
-    the answer "yes" sets both as missing.
-
-    None, not asked, where an effect is named as it is, none was refuted, or the views are many.
+    A second missing effect can make the first look different in each half of the views, or like a smooth error of the
+    scanner. If both hold beside each other, the answer is "yes": both are missing, and what refuted the first is taken
+    back. None, not asked, where nothing was refuted, or the views are many.
     """
-    proposed = evidence.proposed
-    if proposed is None or proposed.verdict != "missing_effect" or evidence.named or case.many_views:
+    before_tests = evidence.proposed
+    if before_tests is None or before_tests.verdict != "missing_effect" or evidence.named or case.many_views:
         return None
-    pair = _pair_that_stands(case, replace(evidence, explanation=proposed.explanation))
+    pair = _pair_that_stands(case, evidence, before_tests.explanation[0])
     if pair is None:
         return Reply("no")
-    not_refuted = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
-    return Reply(f"yes, beside {pair[1].name}", {**both_missing(pair), **not_refuted})
+    taken_back = {"notes": before_tests.notes, "refuted": False, "scanner_error": None}
+    return Reply(f"yes, beside {pair[1].name}", {**both_missing(pair), **taken_back})
 
 
 def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
@@ -154,12 +151,12 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
         return None
     named = evidence.named[0]
     least = next(r.log_posterior for r in evidence.ranked if r.name == named.name) - limits.ODDS
-    rivals = {
-        r.name: r
-        for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
-        if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
-        if r.log_posterior > least or not any(p.discrete for e in (r, named) for p in e.score.candidate.parameters)
-    }
+    rivals = dict[str, Ranked]()
+    for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]:
+        has_event = any(p.discrete for e in (r, named) for p in e.score.candidate.parameters)
+        is_refused = any(r.name in note for note in evidence.notes)
+        if r.name != named.name and is_contender(r) and not is_refused and (r.log_posterior > least or not has_event):
+            rivals[r.name] = r
     validations = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
     left_out = dict(evidence.left_out) | validations
     ahead = [name for name, validation in validations.items() if validation.better_than(left_out[named.name])]
@@ -169,7 +166,7 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
         rivals, named = rivals | {named.name: named}, rivals[better]
     as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
     if as_good and not case.many_views:
-        pair = _pair_that_stands(case, evidence)
+        pair = _pair_that_stands(case, evidence, evidence.explanation[0])
         if pair is not None:
             return Reply(f"none beside {pair[1].name}", both_missing(pair))
     return Reply(names_of(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
@@ -292,9 +289,9 @@ def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
         names = {r.name for r in evidence.named}
         of_base = tuple(r for r in of_base if not names & said_by[law_of(r).key])
         return Reply(names_of(of_base) or "no", {"rival_laws": (*evidence.rival_laws, *of_base)})
-    if evidence.named or not evidence.told_laws:
+    if evidence.named or not evidence.reported_laws:
         return None
-    of_base = laws_of_base(case.linear, case.dictionary, evidence.told_laws)
+    of_base = laws_of_base(case.linear, case.dictionary, evidence.reported_laws)
     laws = {law_of(r).key: r for r in (*evidence.laws, *of_base)}
     ranked = tuple(sorted(laws.values(), key=lambda r: -r.log_posterior))
     return Reply(names_of(of_base) or "no", {"laws": ranked} if of_base else {})
@@ -389,14 +386,13 @@ def _scanner_error_in_place_of(linear: LinearModel, evidence: Evidence) -> Field
     return error if scanner_explains_it(replace(evidence, scanner_error=error)) else None
 
 
-def _pair_that_stands(case: Case, evidence: Evidence) -> tuple[Ranked, Ranked] | None:
-    """Return the first effect of the explanation and a second one, if both pass every test beside each other.
+def _pair_that_stands(case: Case, evidence: Evidence, first: Ranked) -> tuple[Ranked, Ranked] | None:
+    """Return an effect and a second one that is missing beside it, if both pass every test beside each other.
 
     None where there is no second effect, where it replaces the first, or where the scanner explains as much.
     """
-    named = evidence.explanation[0]
-    pair = find_missing_pair(case.linear, case.candidates, named)
-    if pair is None or pair[0].name != named.name or not pair_is_validated(case.linear, pair):
+    pair = find_missing_pair(case, first)
+    if pair is None or pair[0].name != first.name or not pair_is_validated(case.linear, pair):
         return None
     both = replace(evidence, refuted=False, scanner_error=None, **both_missing(pair))
     return pair if _scanner_error_in_place_of(case.linear, both) is None else None

@@ -17,6 +17,7 @@ import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.law_ranking import rank_laws
 from stitch.diagnosis.ranking import (
     Ranked,
     conditioned_on_effects,
@@ -31,7 +32,7 @@ from stitch.diagnosis.ranking import (
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, promising, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
+from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of
 from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -132,7 +133,7 @@ def are_several_required(case: Case, evidence: Evidence) -> Reply | None:
     """Are several effects required of which none is certain by itself?"""
     if evidence.alarm:
         return None
-    group = required_group(case.linear, case.candidates, len(evidence.ranked))
+    group = required_group(case, len(evidence.ranked))
     return Reply(names_of(group) or "no", {"explanation": group}, ends=bool(group))
 
 
@@ -218,7 +219,7 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
     best = evidence.explanation[0]
     if not _beaten_by_unmodelled(best.log_posterior, evidence):
         return Reply("no")
-    second = find_second_effect(case.linear, case.candidates, best)
+    second = find_second_effect(case, best)
     if second is not None:
         prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
         of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
@@ -262,7 +263,7 @@ def are_two_missing(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: are two missing, of which one alone took for itself what both do?"""
     if len(evidence.explanation) == 1 or case.many_views:
         return None
-    pair = find_missing_pair(case.linear, case.candidates, evidence.explanation[0])
+    pair = find_missing_pair(case, evidence.explanation[0])
     return Reply("no") if pair is None else Reply(names_of(pair), both_missing(pair))
 
 
@@ -356,7 +357,7 @@ def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
     )
 
 
-def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
+def required_group(case: Case, tests: int) -> tuple[Ranked, ...]:
     """Return effects of which at least one is needed though none is certain by itself, likeliest first; () if none is.
 
     None is certain since random effects of joints and links in the model explain whatever it would. So all these are
@@ -367,13 +368,14 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     Args:
         tests: number of candidates among which the best is chosen.
     """
+    linear = case.linear
     # Names of effects that are random effects of the model.
     random_effects = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
     without_any = linear.without(random_effects)
     if not random_effects or without_any.null.deviance < linear.null.deviance:
         # No error of joints or links helps: none stands in for another.
         return ()
-    known = {c.name: c for c in candidates if not c.empirical}
+    known = {c.name: c for c in case.candidates if not c.empirical}
     ranked = rank([score(without_any, c) for c in known.values()], tests)[0]
     best = next((r for r in ranked if is_certain(r)), None)
     if best is None:
@@ -395,31 +397,28 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     return tuple(near) if len(near) > 1 else group
 
 
-def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
+def find_second_effect(case: Case, best: Ranked) -> Ranked | None:
     """Return the likeliest effect that is certain with the best one in the model; None where there is none."""
-    others = [c for c in candidates if c.name != best.name and not c.empirical]
-    ranked, _ = rank_all(conditioned_on_effects(linear, [best]), others)
+    others = [c for c in case.candidates if c.name != best.name and not c.empirical]
+    ranked, _ = rank_all(conditioned_on_effects(case.linear, [best]), others)
     return next((r for r in ranked if is_certain(r)), None)
 
 
-def find_missing_pair(
-    linear: LinearModel, candidates: Sequence[Candidate], best: Ranked
-) -> tuple[Ranked, Ranked] | None:
+def find_missing_pair(case: Case, best: Ranked) -> tuple[Ranked, Ranked] | None:
     """Return two missing effects, each scored with the other in the model; None where there is no such pair.
 
     The second is the likeliest beside `best`; the first, usually `best` again, is the likeliest beside the second. Each
     must be certain beside the other, and beside the second no other contender may be within 20 to 1 of the first.
     """
-    second = find_second_effect(linear, candidates, best)
+    second = find_second_effect(case, best)
     if second is None:
         return None
-    others = [c for c in candidates if c.name != second.name and not c.empirical]
-    first, *rest = rank_all(conditioned_on_effects(linear, [second]), others)[0]
-    if not is_certain(first) or any(
-        is_contender(r) and r.log_posterior > first.log_posterior - limits.ODDS for r in rest
-    ):
+    others = [c for c in case.candidates if c.name != second.name and not c.empirical]
+    first, *rest = rank_all(conditioned_on_effects(case.linear, [second]), others)[0]
+    least = first.log_posterior - limits.ODDS
+    if not is_certain(first) or any(is_contender(r) and r.log_posterior > least for r in rest):
         return None
-    again = rank_one(conditioned_on_effects(linear, [first]), second.score.candidate, tests=len(others))
+    again = rank_one(conditioned_on_effects(case.linear, [first]), second.score.candidate, tests=len(others))
     return (first, again) if is_certain(again) else None
 
 

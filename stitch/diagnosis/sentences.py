@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.law_ranking import law_size
 from stitch.diagnosis.ranking import Ranked, beyond_belief_text
 from stitch.diagnosis.residual_structure import NOT_REPEATING
-from stitch.diagnosis.systematic_laws import Law, law_of, law_size
+from stitch.diagnosis.systematic_laws import Law, law_of
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
@@ -20,6 +21,8 @@ from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.
 _MAX_CURVES = 2
+# Fitted parameters that are told, those with the most sigmas.
+_MOST_AMOUNTS = 3
 # Share of the expected scatter beyond which an error of the surface that does not show is told (custom).
 _LEAST_SHAPE = 0.5
 _CAUSES = (
@@ -188,8 +191,8 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
         yield f"{beside} pose errors repeat{amount}: they {' and '.join(error.words for error in errors)}."
         yield f"Apart from that the poses scatter by {scatter}."
     elif not d.implausible:
-        shown = d.rotation > 0 or d.translation > 0
-        yield f"The poses scatter by {scatter}." if shown else "The measured points do not show the poses."
+        scatters = d.rotation > 0 or d.translation > 0
+        yield f"The poses scatter by {scatter}." if scatters else "The measured points do not show the poses."
         if d.beyond_expected:
             yield f"{_allowed(d, length_unit)} So more is left than scatter explains."
     elif d.overlap_misfit:
@@ -234,9 +237,9 @@ def _laws_found(d: Diagnosis) -> Iterator[str]:
     """Yield sentences on the laws of the dictionary that explain the rest, with sizes and advice; nothing without."""
     if not d.laws:
         return
-    told = [f"{law_in_words(law_of(r))}, by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
-    among = "A law does" if len(told) == 1 else "One of these laws does, and these views cannot tell which"
-    yield f"{among}: {_listed(told, 'or')} (p = {d.laws[0].adjusted:.1g})."
+    laws = [f"{law_in_words(law_of(r))}, by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
+    among = "A law does" if len(laws) == 1 else "One of these laws does, and these views cannot tell which"
+    yield f"{among}: {_listed(laws, 'or')} (p = {d.laws[0].adjusted:.1g})."
     yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."
 
 
@@ -299,9 +302,9 @@ def scanner_advice(error: FieldError | None, length_unit: str) -> Iterable[str]:
 
 def curve_sentences(d: Diagnosis, length_unit: str) -> list[str]:
     """Return sentences on trends without a name: of up to `_MAX_CURVES` joints, what these follow, and in time."""
-    shown = d.curves[:_MAX_CURVES]
-    sentences = [joint_curve_sentence(curve) for curve in shown]
-    undecided = {curve.joint: curve.may_follow for curve in shown if len(curve.may_follow) > 1}
+    curves = d.curves[:_MAX_CURVES]
+    sentences = [joint_curve_sentence(curve) for curve in curves]
+    undecided = {curve.joint: curve.may_follow for curve in curves if len(curve.may_follow) > 1}
     sentences += [
         f"These views do not tell whether joint {joint} follows {_listed(others, 'or')}."
         for joint, others in undecided.items()
@@ -376,16 +379,12 @@ def posterior_text(verdict: str, named: Sequence[str], posteriors: dict[str, flo
     return "cannot tell" if len(named) == 1 else f"{together:.2f} together"
 
 
-def fitted_amounts(ranked: Ranked, at_most: int = 3) -> str:
-    """Return the parameters of the best form as text, c2 = 0.44 ± 0.04 µrad/(N m): gridded ones, then the clearest.
-
-    Args:
-        at_most: number of fitted parameters; those with the most sigmas are taken.
-    """
+def fitted_amounts(ranked: Ranked) -> str:
+    """Return the parameters of the best form as text, c2 = 0.44 ± 0.04 µrad/(N m): gridded first, then the clearest."""
     scored = ranked.score
     if not scored.fitted:
         return "too small to be worth a fit"
-    clearest = np.argsort(-np.abs(scored.values) / np.maximum(scored.sigmas, 1e-300))[:at_most]
+    clearest = np.argsort(-np.abs(scored.values) / np.maximum(scored.sigmas, 1e-300))[:_MOST_AMOUNTS]
     tried = [f"{p.name} = {p.formatted}" for p in scored.form.term.parameters if p.grid]
     fitted = []
     for i in sorted(clearest):

@@ -7,8 +7,7 @@ may move what the reference carries (the part, and the base of an arm whose base
 far end of the arm, any one joint, or the length of one link, which follows no angle; as a line or smoothly; in all six
 numbers, as a turn or a shift, or along or about one axis.
 
-A place and what it follows are one law, each as likely before as any other; its forms share that. All forms are sized
-at the variances of the model, the likeliest few with all variances anew (`score.try_form`), as effects are.
+A place and what it follows are one law, each as likely before as any other; its forms share that.
 
 A law that an effect of the library or of a user says too is no rival of it: it is that effect, by its name. What turns
 the first joint turns the base about its axis, and the last one what the flange carries; they are one place. So is a
@@ -20,24 +19,20 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 
 import numpy as np
-from scipy.special import logsumexp
 
-from stitch.diagnosis import thresholds as limits
-from stitch.diagnosis.candidates import Candidate, Form
+from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.ranking import Ranked
-from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import Score, try_form
-from stitch.effects.contract import EFFECTS, Effect, Parameter, per_joint
+from stitch.effects.contract import EFFECTS, Effect, per_joint
 from stitch.model.forward import pose_derivatives
-from stitch.model.model import Term, term_of
+from stitch.model.model import term_of
 from stitch.numerics import frames
-from stitch.numerics.distributions import f_limits
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel, Observation
 from stitch.observations.pose_errors import usual_twist
 from stitch.session.measurement import TEMPERATURES, Views
 from stitch.session.robot import Links
+from stitch.session.scan import even_indices
 
 TIME = "time_s"
 # Waves along a joint's angle, and how many there are a turn.
@@ -54,12 +49,8 @@ NUMBER = "view number"
 GRAVITY = "gravity"
 # Degree of a smooth function of a covariate; each power usually half as large as the one before.
 _DEGREE = 3
-# Views that a step leaves at either end at least; steps that are tried at the most; laws, and forms of each, that are
-# fitted with all variances (time).
+# Views that a step leaves at either end at least, and steps that are tried at the most.
 _VIEWS_AT_END, _MOST_STEPS = 2, 50
-_LAWS_FITTED, _FORMS_OF_A_LAW_FITTED = 6, 2
-# Nats by which a place may come nearer to the likeliest once variances are fitted again.
-_GAIN_BY_FIT = 2.0
 # Columns of which this share of the square is in the span of others say the same.
 _SAME = 0.999
 # Values that differ by less are constant.
@@ -69,8 +60,9 @@ _FALL_AXES = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [-1, 1, 0], [0, 0, 1]])
 _FALL_WORDS = ("along x", "between x and y", "along y", "between y and -x", "along z")
 # What friction holds of the weight, steel on steel.
 _FRICTION = 0.2
-_BODIES = ("part", "mount")
-_NOT_LINKS = (*_BODIES, "robot")
+# Kinds of places at the ends of the arm: what stands in the reference frame, and what holds the scanner.
+BODIES = ("part", "mount")
+_NOT_LINKS = (*BODIES, "robot")
 # A joint that turns less (rad) follows nothing of its own angle.
 _STILL = np.radians(2.0)
 # Usual error of a joint (rad); that of a flange is `usual_twist`.
@@ -79,10 +71,6 @@ _USUAL_JOINT = 4e-4
 _USUAL_GROWTH = 2e-4
 # Share of a law by which a link's length follows anything but warmth and time (judgement).
 _SELDOM_GROWS = 0.1
-# Random residuals that are drawn for the family-wise p-value, and their seed. Bonferroni's value beyond which it is not
-# sought, since no law is clear, and number of observations beyond which drawing takes too long.
-_DRAWS, _SEED = 499, 20
-_LARGEST_P_VALUE, _MOST_OBSERVATIONS = 1.0, 400
 
 
 def _grow(links: Links, views: Views, g: Array) -> Links:
@@ -186,6 +174,20 @@ class Law:
 
 
 @dataclass(frozen=True)
+class LawEffect(Effect):
+    """A law as a candidate among effects; it has no function, since no law is ever added to a model."""
+
+    law: Law = None  # type: ignore[assignment]
+
+
+def law_of(ranked: Ranked) -> Law:
+    """Return the law that a ranked candidate is; only for candidates of `law_ranking`."""
+    effect = ranked.score.candidate.effect
+    assert isinstance(effect, LawEffect)
+    return effect.law
+
+
+@dataclass(frozen=True)
 class Dictionary:
     """All laws that views can show, in all their forms, with the prior share of each form in its law."""
 
@@ -282,248 +284,7 @@ def stacked(laws: Sequence[Law]) -> Iterator[tuple[Place, Array, Indices]]:
         yield laws[indices[0]].place, np.array(shapes), np.reshape(indices, (len(shapes), -1))
 
 
-def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]:
-    """Return the likeliest laws beside a model, best first, with their log posterior as that of effects (`Ranked`).
-
-    All forms are sized at given variances: those of the null, or of another maximum of the null's likelihood. The best
-    forms of the likeliest laws are then fitted with all variances. A law has the summed evidence of its forms.
-    """
-    laws, shares, forms_of = dictionary.laws, dictionary.shares, dictionary.forms_of
-    if not laws:
-        return ()
-    starts = (linear, *linear.alternative_starts)
-    gains, scales = np.full(len(laws), -np.inf), np.ones(len(laws))
-    best_start = np.zeros(len(laws), np.int64)
-    for k, at in enumerate(starts):
-        gain, scale = _gains(at, dictionary)
-        gain = gain + 0.5 * (linear.null.deviance - at.null.deviance)
-        better = gain > gains
-        gains, scales = np.where(better, gain, gains), np.where(better, scale, scales)
-        best_start[better] = k
-    weighted = gains + np.log(shares)
-    prior = float(np.log(limits.PRIOR_LAWS / len(forms_of)))
-    ranked = list[Ranked]()
-    for key in _laws_to_fit(dictionary, weighted):
-        forms = sorted(forms_of[key], key=lambda i: -weighted[i])
-        fits = dict[int, Score]()
-        for i in forms[:_FORMS_OF_A_LAW_FITTED]:
-            fits[i] = _fit_law(linear, laws[i], starts[best_start[i]].null.variances, float(scales[i]))
-            weighted[i] = fits[i].log_bayes_factor + np.log(shares[i])
-        best = max(fits, key=lambda i: weighted[i])
-        total = float(logsumexp(weighted[forms]))
-        # Bonferroni over the laws, and over the forms of the law by their shares.
-        p_value = fits[best].p_value / float(shares[best]) * len(forms_of)
-        ranked.append(Ranked(replace(fits[best], log_bayes_factor=total), p_value, total + prior, 0.0, len(forms_of)))
-    ranked.sort(key=lambda r: -r.log_posterior)
-    first, *others = ranked
-    others = [replace(r, adjusted=min(r.adjusted, 1.0)) for r in others]
-    return replace(first, adjusted=_family_wise(linear, dictionary, first)), *others
-
-
-def _laws_to_fit(dictionary: Dictionary, weighted: Array) -> list[tuple[str, str]]:
-    """Return the keys of the likeliest laws, and of the likeliest law of every place that may be the one.
-
-    Args:
-        weighted: (L,) log Bayes factor of each form plus the log of its share.
-    """
-    forms_of = dictionary.forms_of
-    order = sorted(forms_of, key=lambda key: -np.logaddexp.reduce(weighted[forms_of[key]]))
-    likeliest = order[:_LAWS_FITTED]
-    if weighted.max() > limits.LOG_BAYES_FACTOR:
-        # The place is reported too, so that every place that comes near is fitted. Reversed: the likeliest law remains.
-        best_of_place = {place: key for key in reversed(order) for place in key[:1]}
-        near = weighted.max() - limits.ODDS - _GAIN_BY_FIT
-        best_keys = [key for key in best_of_place.values() if key not in likeliest]
-        likeliest += [key for key in best_keys if weighted[forms_of[key]].max() > near]
-    return likeliest
-
-
-def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) -> float:
-    """Return the family-wise p-value of the clearest law: the chance that any law looks as clear in mere scatter.
-
-    Bonferroni's value is too large, since laws resemble each other. Where it does not decide by itself, residuals are
-    drawn at random `_DRAWS` times, and the draws counted in which some law is as clear (Monte Carlo test).
-
-    Args:
-        ranked: the law, with Bonferroni's value in `adjusted`.
-    """
-    bonferroni = ranked.adjusted
-    decided = bonferroni < limits.ALPHA_UNKNOWN or bonferroni > _LARGEST_P_VALUE
-    if decided or linear.mixed.z.size > _MOST_OBSERVATIONS:
-        return min(bonferroni, 1.0)
-    rng = np.random.default_rng(_SEED)
-    known = linear.mixed.size - linear.design.shape[1]
-    # Student's t: white residuals over a scatter that is known to so many degrees of freedom.
-    residuals = rng.standard_normal((linear.mixed.z.size, _DRAWS)) / np.sqrt(rng.chisquare(known, _DRAWS) / known)
-    by_rank: dict[int, list[tuple[Array, float]]] = {}
-    for law, share in zip(dictionary.laws, dictionary.shares, strict=True):
-        U = column_space(linear.residual(law.reduced_columns(linear.observation)))
-        by_rank.setdefault(U.shape[1], []).append((U, share))
-    as_clear = np.zeros(_DRAWS, bool)
-    for rank, laws in by_rank.items():
-        if not rank:
-            continue
-        # The explained square of each form at which its p-value, corrected by Bonferroni, is that of the law.
-        p_values = np.array([bonferroni * share for _, share in laws]) / len(dictionary.forms_of)
-        limit = rank * f_limits(np.minimum(p_values, 1.0), rank, known)
-        squares = (np.hstack([U for U, _ in laws]).T @ residuals) ** 2
-        as_clear |= (squares.reshape(len(laws), rank, -1).sum(axis=1) >= limit[:, None]).any(axis=0)
-    return float((1 + as_clear.sum()) / (1 + _DRAWS))
-
-
-def laws_of_base(
-    linear: LinearModel, dictionary: Dictionary, laws: Sequence[Ranked], effect: Score | None = None
-) -> tuple[Ranked, ...]:
-    """Return the laws of the base by which it would do what a joint's law does, each as likely as the joint's.
-
-    For each given law of a joint that a moving base could be, it is the base with the same driver and shape.
-
-    Args:
-        dictionary: all laws that were tried.
-        laws: ranked laws; those that are not of a joint are passed over.
-        effect: score of a named effect that says the joint's law; None: the law as it was fitted.
-    """
-    of_base = list[Ranked]()
-    for ranked in laws:
-        law, scored = law_of(ranked), effect or ranked.score
-        if law.place.joint is None or law.place.with_base:
-            continue
-        if not could_be_base(linear, scored.form.columns @ scored.values, law.shapes):
-            continue
-        follows = (law.driver.name, law.shape)
-        for other in dictionary.laws:
-            of_body = other.place.kind in _BODIES and other.place.with_base
-            if of_body and other.is_full and (other.driver.name, other.shape) == follows:
-                base_score = _fit_law(linear, other, linear.null.variances, 1.0)
-                of_base.append(replace(ranked, score=base_score))
-    return tuple(of_base)
-
-
-def could_be_base(linear: LinearModel, effect: Array, shapes: Array) -> bool:
-    """Return whether the base, moving along and about its own axes by the same shapes, would explain an effect as well.
-
-    It would where what the base leaves of the effect is small on two scales: beside the scatter, so that likelihoods
-    differ by less than 20 to 1, and beside the effect itself, so that the two are aliases in these views.
-
-    Args:
-        effect: (n,) what the effect does to the reduced observations.
-        shapes: (V, R) of its motion over the views; the base has a free coefficient for each along and about each axis.
-    """
-    # Where the scanner is carried, the base stands where the part does; where it is fixed, with the scanner.
-    bodies = [twists for _, _, twists in _bodies(linear)]
-    base = bodies[1] if linear.measurement.eye_to_hand else bodies[0]
-    twists = (base[:, :, :, None] * shapes[:, None, None, :]).reshape(6 * len(base), -1)
-    basis = column_space(linear.residual(linear.observation.from_twists(twists)))
-    white = linear.residual(effect[:, None])[:, 0]
-    left_square = float(np.sum((white - basis @ (basis.T @ white)) ** 2))
-    alias_square = (1 - limits.ALIAS_CORRELATION**2) * float(np.sum(white**2))
-    # A log likelihood is half a sum of squares.
-    return left_square < min(2 * limits.ODDS, alias_square)
-
-
-def law_of(ranked: Ranked) -> Law:
-    """Return the law that a ranked candidate is; only for those of `rank_laws` and `laws_of_base`."""
-    effect = ranked.score.candidate.effect
-    assert isinstance(effect, LawEffect)
-    return effect.law
-
-
-def law_size(linear: LinearModel, ranked: Ranked) -> tuple[float, float, str]:
-    """Return size, sigma and unit of a law: the range of a joint's error (rad), or the largest displacement.
-
-    A displacement is that of the part in a view, against the first view, in the length unit.
-    """
-    scored = ranked.score
-    law = law_of(ranked)
-    if law.place.joint is not None:
-        change = law.shapes - law.shapes[np.argmin(law.shapes @ scored.values)]
-        farthest = change[np.argmax(np.abs(change @ scored.values))]
-        unit = "rad"
-    else:
-        moved = np.stack([linear.observation.part_displacements(column) for column in scored.form.columns.T], axis=2)
-        moved = moved - moved[0]
-        k = int(np.argmax(np.linalg.norm(moved @ scored.values, axis=1)))
-        along = moved[k] @ scored.values
-        farthest = along / max(float(np.linalg.norm(along)), 1e-300) @ moved[k]
-        unit = linear.measurement.length_unit
-    sigma = float(np.sqrt(max(farthest @ scored.covariance @ farthest, 0.0)))
-    return abs(float(farthest @ scored.values)), sigma, unit
-
-
-@dataclass(frozen=True)
-class LawEffect(Effect):
-    """A law as a candidate among effects; it has no function, since no law is ever added to a model."""
-
-    law: Law = None  # type: ignore[assignment]
-
-
-def _fit_law(linear: LinearModel, law: Law, start: Array, scale: float) -> Score:
-    """Return the score of a law as a candidate effect, fitted with all variances.
-
-    Args:
-        start: (c,) variances to begin with.
-        scale: likeliest multiple of its usual sizes.
-    """
-    reduced = law.reduced_columns(linear.observation)
-    units = np.repeat(np.array(law.place.units)[law.axes], law.shapes.shape[1])
-    parameters = tuple(
-        Parameter(f"c{i}", str(unit), typical=float(size))
-        for i, (unit, size) in enumerate(zip(units, law.sizes, strict=True))
-    )
-    kind = law.place.kind
-    effect = LawEffect(
-        law.words, kind, {}, _no_function, needs=(), prefers=(), tier="empirical", group=law.driver.name, law=law
-    )
-    response = linear.observation.expand(reduced)
-    form = Form(Term(effect, parameters), np.ones(len(parameters), bool), response, reduced, law.sizes)
-    trial = try_form(linear, form, start, scale)
-    assert trial.values is not None and trial.covariance is not None
-    return Score(
-        Candidate(effect, (form,), response, None),
-        True,
-        form,
-        trial.p_value,
-        trial.log_bayes_factor,
-        values=trial.values,
-        covariance=trial.covariance,
-        scale=trial.scale,
-        variances=trial.variances,
-    )
-
-
-def _no_function(*_: object) -> None:
-    """A law of the dictionary"""
-
-
-def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
-    """Return log Bayes factors (L,) of all L forms at the null's variances, over all scales, and the likeliest scales.
-
-    A scale s multiplies the usual sizes, the unit of the coefficients here. With eigenvalues k of their information and
-    the score g along its eigenvectors, log BF at scale s is ½ Σ [s² g² / (1 + s² k) − log(1 + s² k)].
-    """
-    scales = regime_of(linear).scales
-    s = np.array(list(scales))[:, None, None, None]
-    log_shares = np.log(list(scales.values()))[:, None, None]
-    gains, likeliest = np.zeros((2, len(dictionary.laws)))
-    for place, shapes, index in dictionary.stacks:
-        information, vector = linear.information_of_motions(place.twists, shapes)
-        forms = [dictionary.laws[i] for i in index[0]]
-        # Forms with equally many axes at once: arrays are (scales, shapes, forms, coefficients).
-        for axis_count in {len(form.axes) for form in forms}:
-            same = [f for f, form in enumerate(forms) if len(form.axes) == axis_count]
-            columns = np.array([forms[f].column_indices for f in same])
-            sizes = np.array([forms[f].sizes for f in same])
-            squared_sizes = sizes[:, :, None] * sizes[:, None, :]
-            k, vectors = np.linalg.eigh(information[:, columns[:, :, None], columns[:, None, :]] * squared_sizes)
-            g = np.einsum("sfij,sfi->sfj", vectors, vector[:, columns] * sizes)
-            square = s**2 * np.maximum(k, 0.0)
-            evidence = 0.5 * (s**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=3) + log_shares
-            gains[index[:, same]] = logsumexp(evidence, axis=0)
-            likeliest[index[:, same]] = s[evidence.argmax(axis=0), 0, 0, 0]
-    return gains, likeliest
-
-
-def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
+def bodies_of(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
     """Yield the two bodies at the ends of the arm: what stands in the reference frame, then what holds the scanner.
 
     Each as name, kind, and (V, 6, 6): left twists of the views about the observation's centre per unit of a twist of
@@ -536,7 +297,7 @@ def _bodies(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
         names = ("the part on the flange", "the scanner's stand or the base")
     else:
         names = ("the part or the base", "the scanner or its mount")
-    for name, kind, carried in zip(names, _BODIES, (still, measurement.capture.T_reference_mount), strict=True):
+    for name, kind, carried in zip(names, BODIES, (still, measurement.capture.T_reference_mount), strict=True):
         yield name, kind, frames.adjoint(to_centre @ carried)
 
 
@@ -554,7 +315,7 @@ def _places(linear: LinearModel) -> Iterator[Place]:
     units = ("rad",) * 3 + (measurement.length_unit,) * 3 + ("rad",) * 3
     bodies = list[Array]()
     about_centre = np.broadcast_to(np.eye(6)[:, :3], (count, 6, 3))
-    for name, kind, moved in _bodies(linear):
+    for name, kind, moved in bodies_of(linear):
         rotations = moved[:, :3, :3]
         turned_mount = np.concatenate([rotations, np.zeros_like(rotations)], axis=1)
         about = turned_mount if kind == "mount" else about_centre
@@ -588,7 +349,7 @@ def drivers_of(views: Views) -> Iterator[Driver]:
         if np.ptp(values) > _CONSTANT:
             yield Driver(name, unit, values, _smooth_shapes(values))
     starts = np.arange(_VIEWS_AT_END, views.count - _VIEWS_AT_END + 1)
-    tried = starts[np.unique(np.linspace(0, len(starts) - 1, min(len(starts), _MOST_STEPS)).astype(int))]
+    tried = starts[even_indices(len(starts), _MOST_STEPS)]
     steps = {f"a step at view {views.names[views.number[k]]}": (order >= k)[:, None].astype(float) for k in tried}
     if steps:
         yield Driver(STEP, "view", order, steps)
@@ -742,18 +503,17 @@ def _says(
     """
     effect = candidate.effect
     # An external axis moves a body as a whole: the part, or the base of what it carries.
-    if effect.place != place.kind and not (effect.place == "axis" and place.kind in _BODIES):
+    if effect.place != place.kind and not (effect.place == "axis" and place.kind in BODIES):
         return False
     follows = {*effect.needs, *effect.prefers}
     if effect.prefers and not any(views.has(name) for name in effect.prefers):
         follows.add(TIME)
     event = any(p.discrete for p in candidate.parameters)
     declared = driver.name in follows or (driver.name == STEP and event)
-    of_body = place.joint is None and place.kind != "links"
-    if of_body and declared:
+    if place.kind in BODIES and declared:
         return True
     if (driver.name == STEP) != event:
         return False
-    if of_body:
+    if place.kind in BODIES:
         return any(law.contains(span) for law in law_spans() for span in effect_spans)
     return any(span.contains(law) for law in law_spans() for span in effect_spans)

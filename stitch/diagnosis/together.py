@@ -9,18 +9,19 @@ view, and time constants, are a session's own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidates_of
+from stitch.diagnosis.law_ranking import rank_laws
 from stitch.diagnosis.ranking import rank_all
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, form_weights
 from stitch.diagnosis.sentences import odds_text
-from stitch.diagnosis.systematic_laws import dictionary_of, law_of, rank_laws
+from stitch.diagnosis.systematic_laws import dictionary_of, law_of
 from stitch.diagnosis.unmodelled_time_effects import least_log_bayes_factor
 from stitch.diagnosis.verdict import Verdict
 from stitch.effects.contract import Parameter
@@ -77,11 +78,17 @@ def decide_together(linears: Sequence[LinearModel]) -> Together:
     names = [name for name in common if any(of_session[name].score.observable for of_session in by_name)]
     scores = {name: [of_session[name].score for of_session in by_name] for name in names}
     otherwise = _each_its_own(linears, tried, scores)
-    shared = [_shared(linears, of, len(names)) for of in scores.values() if _is_shared(of[0].candidate)]
-    # The same effect with separate values in every session is no rival: the name would be the same.
-    own = {s.name: otherwise.pop(s.name) for s in shared}
     shared = [
-        s if np.isinf(s.log_posterior) else replace(s, log_posterior=max(s.log_posterior, own[s.name])) for s in shared
+        _shared(linears, of_effect, len(names))
+        for of_effect in scores.values()
+        # Not an effect of the part or of the scanner, nor one that begins at some view or has a time constant.
+        if of_effect[0].candidate.effect.place in ARM_PLACES and not of_effect[0].candidate.forms[0].term.gridded.any()
+    ]
+    # The same effect with separate values in every session is no rival: the name would be the same.
+    separately = {s.name: otherwise.pop(s.name) for s in shared}
+    shared = [
+        s if np.isinf(s.log_posterior) else replace(s, log_posterior=max(s.log_posterior, separately[s.name]))
+        for s in shared
     ]
     shared.sort(key=lambda s: -s.log_posterior)
     rival = max(otherwise, key=lambda name: otherwise[name], default="")
@@ -135,55 +142,66 @@ def together_document(together: Together, sessions: Sequence[str]) -> dict[str, 
     }
 
 
-def _is_shared(candidate: Candidate) -> bool:
-    return candidate.effect.place in ARM_PLACES and not candidate.forms[0].term.gridded.any()
+class _Statistics(NamedTuple):
+    """What one session says of p free parameters θ of an effect: the log likelihood bᵀθ − ½ θᵀIθ + gain."""
+
+    free: Sequence[Parameter]
+    information: Array  # I (p, p)
+    vector: Array  # b (p,)
+    gain: float  # by the variances that the effect leaves there, over those of the null fit
+
+
+def _statistics(linear: LinearModel, scored: Score) -> _Statistics:
+    """Return I = Xᵀ C⁻¹ X and b = Xᵀ C⁻¹ y of an effect in one session, C at the variances that it leaves there."""
+    variances = linear.null.variances
+    # Variances of a model with other components of scatter are not this one's.
+    if scored.variances is not None and len(scored.variances) == len(variances):
+        variances = scored.variances
+    at = replace(linear, null=at_variances(linear.mixed, variances))
+    whole = scored.candidate.forms[0]
+    ((information, vector),) = at.information([whole.selected])
+    return _Statistics(whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance))
 
 
 def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int) -> Shared:
     """Return one effect fitted with common parameters to all sessions, with its log Bayes factor.
 
-    Session s gives the information I_s = Xᵀ C⁻¹ X and the vector b_s = Xᵀ C⁻¹ y of the parameters, at the variances
-    that the effect leaves there. Both are added over the sessions: the estimate is (Σ I_s)⁻¹ Σ b_s. The change of each
-    session's likelihood by these variances is added to the log Bayes factor. An effect whose known load should show and
-    does not has a log Bayes factor of −inf.
+    I and b of the sessions (`_statistics`) are added: the estimate is (Σ I)⁻¹ Σ b. So are their gains by variances, to
+    the log Bayes factor. An effect whose known load should show and does not has a log Bayes factor of −inf.
 
     Args:
         scores: of the effect, one a session.
         tests: number of effects among which it was chosen.
     """
-    parts = []
-    for linear, scored in zip(linears, scores, strict=True):
-        variances = linear.null.variances
-        # Variances of a model with other components of scatter are not this one's.
-        if scored.variances is not None and len(scored.variances) == len(variances):
-            variances = scored.variances
-        at = replace(linear, null=at_variances(linear.mixed, variances))
-        whole = scored.candidate.forms[0]
-        ((information, vector),) = at.information([whole.selected])
-        parts.append((whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance)))
+    of_sessions = [_statistics(linear, scored) for linear, scored in zip(linears, scores, strict=True)]
     # Sessions may have different free parameters: all of them are numbered.
-    known = {p.name: p for free, *_ in parts for p in free}
-    number = {name: k for k, name in enumerate(known)}
-    total, towards = np.zeros((len(known), len(known))), np.zeros(len(known))
-    for free, information, vector, _ in parts:
-        at_numbers = [number[p.name] for p in free]
-        total[np.ix_(at_numbers, at_numbers)] += information
-        towards[at_numbers] += vector
-    sizes = np.array([p.typical for p in known.values()])
+    parameters = {p.name: p for session in of_sessions for p in session.free}
+    number = {name: k for k, name in enumerate(parameters)}
+    information = np.zeros((len(number), len(number)))
+    vector = np.zeros(len(number))
+    for session in of_sessions:
+        rows = [number[p.name] for p in session.free]
+        information[np.ix_(rows, rows)] += session.information
+        vector[rows] += session.vector
     scales = regime_of(linears[0]).scales
+    # The session with the most free parameters has all forms of the effect.
     longest = max((scored.candidate for scored in scores), key=lambda c: len(c.forms[0].free))
-    gains = []
-    for form in longest.forms:
-        index = np.array([number[p.name] for p in form.free])
-        both = total[np.ix_(index, index)] * np.outer(sizes[index], sizes[index])
-        gains.append(log_mixture(log_evidence_at_scales(both, towards[index] * sizes[index], scales), scales))
-    gained = float(logsumexp(np.array(gains) + np.log(form_weights(longest)))) + sum(part[-1] for part in parts)
-    prior = float(np.log(limits.PRIOR_PHYSICAL * longest.effect.prior / tests))
-    index = np.array([number[p.name] for p in longest.forms[int(np.argmax(gains))].free])
-    fitted = _fitted([list(known.values())[k] for k in index], total[np.ix_(index, index)], towards[index])
+    sizes = np.array([p.typical for p in parameters.values()])
+    rows_of_forms = [np.array([number[p.name] for p in form.free]) for form in longest.forms]
+    log_bayes_factors = []
+    for of_form in rows_of_forms:
+        in_sizes = information[np.ix_(of_form, of_form)] * np.outer(sizes[of_form], sizes[of_form])
+        evidence = log_evidence_at_scales(in_sizes, vector[of_form] * sizes[of_form], scales)
+        log_bayes_factors.append(log_mixture(evidence, scales))
+    of_all_forms = float(logsumexp(np.array(log_bayes_factors) + np.log(form_weights(longest))))
+    log_bayes_factor = of_all_forms + sum(session.gain for session in of_sessions)
+    best = rows_of_forms[int(np.argmax(log_bayes_factors))]
+    free = [list(parameters.values())[k] for k in best]
+    fitted = _fitted(free, information[np.ix_(best, best)], vector[best])
     if not _grows_with_load(fitted):
         return Shared(longest.name, -np.inf, -np.inf, fitted)
-    return Shared(longest.name, gained, gained + prior, fitted)
+    prior = float(np.log(limits.PRIOR_PHYSICAL * longest.effect.prior / tests))
+    return Shared(longest.name, log_bayes_factor, log_bayes_factor + prior, fitted)
 
 
 def _fitted(free: Sequence[Parameter], information: Array, vector: Array) -> tuple[Parameter, ...]:
@@ -235,5 +253,5 @@ def _grows_with_load(parameters: Sequence[Parameter]) -> bool:
     known = [p for p in parameters if not p.unit.startswith("kg ")]
     if len(known) == len(parameters):
         return True
-    shown = [p for p in known if 2 * p.sigma < p.typical]
-    return not shown or any(p.value > limits.FAINT_SIGMAS * p.sigma for p in known)
+    visible = [p for p in known if 2 * p.sigma < p.typical]
+    return not visible or any(p.value > limits.FAINT_SIGMAS * p.sigma for p in known)

@@ -30,8 +30,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
+from stitch.diagnosis.law_ranking import could_be_base
 from stitch.diagnosis.smooth_processes import SmoothProcess, leading_trends, size_process
-from stitch.diagnosis.systematic_laws import could_be_base
 from stitch.effects.contract import EFFECTS
 from stitch.model.model import term_of
 from stitch.numerics.frames import Array
@@ -133,7 +133,7 @@ class JointEffect:
             # The likelihood has several maxima: the fit begins at the likeliest of several starts.
             nulls = [at.null.variances for at in (base, *base.alternative_starts)]
             variances_of_effect = [times * SMOOTH_SCALE**2 for times in limits.UNMODELLED_VARIANCES]
-            starts: list[Array] = [np.append(variances, own) for variances in nulls for own in variances_of_effect]
+            starts = [np.append(others, of_effect) for others in nulls for of_effect in variances_of_effect]
             null = fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))
         return replace(base, mixed=mixed, pose_errors=errors, null=null, full_model=None)
 

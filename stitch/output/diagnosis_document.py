@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
+from stitch.diagnosis.law_ranking import law_size
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.sentences import law_in_words
-from stitch.diagnosis.systematic_laws import law_of, law_size
+from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.validation import CrossValidation
 from stitch.output.finding_screen import clearest_parameter, finding_screen
 from stitch.output.plain_finding import next_step_line, next_step_without_a_view, plain_finding

@@ -13,7 +13,6 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.effect_trend import (
-    EffectTrend,
     expected_in_view,
     trend_in_model,
     trend_of_curve,
@@ -21,6 +20,7 @@ from stitch.diagnosis.effect_trend import (
     trend_of_law,
     trends_of_candidates,
 )
+from stitch.diagnosis.fitted_effect import EffectTrend
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
 from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS

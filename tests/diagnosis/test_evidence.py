@@ -282,7 +282,7 @@ def best_of(cell, play, drift):
 
 def test_two_effects_are_found_beside_each_other_and_hold(cell):
     linear, candidates, best = best_of(cell, play=4e-4, drift=0.03)
-    pair = find_missing_pair(linear, candidates, best)
+    pair = find_missing_pair(gathering.Case(linear, candidates, None), best)
     assert pair is not None and {r.name for r in pair} == {"backlash", "mount_drift"}
     assert pair_is_validated(linear, pair)
     score = next(r.score for r in pair if r.name == "backlash")
@@ -300,7 +300,8 @@ def test_a_pair_is_refused_where_one_of_the_two_does_not_help_on_views_left_out(
 
 @pytest.mark.parametrize(("play", "drift"), [(6e-4, 0.0), (0.0, 0.05)])
 def test_no_second_effect_is_found_beside_one_that_is_alone(cell, play, drift):
-    assert find_missing_pair(*best_of(cell, play=play, drift=drift)) is None
+    linear, candidates, best = best_of(cell, play=play, drift=drift)
+    assert find_missing_pair(gathering.Case(linear, candidates, None), best) is None
 
 
 @pytest.mark.parametrize(

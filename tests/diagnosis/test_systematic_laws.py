@@ -11,6 +11,7 @@ from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of, candidates_of
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
 from stitch.diagnosis.effect_trend import trend_of_law
+from stitch.diagnosis.law_ranking import law_size, rank_laws
 from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
@@ -23,8 +24,6 @@ from stitch.diagnosis.systematic_laws import (
     Place,
     dictionary_of,
     law_of,
-    law_size,
-    rank_laws,
 )
 from stitch.effects.contract import EFFECTS, effect, twist
 from stitch.numerics.reml import fit_variances
