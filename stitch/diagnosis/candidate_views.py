@@ -60,10 +60,10 @@ def reachable(
     """
     joints = nearby(driven, chosen, seed)
     poses = poses_of(joints)
-    there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
+    centre_seen = frames.transform(frames.inverse(poses), centre[None])[:, 0]
     before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]
     margin = _MARGIN * np.linalg.norm(before, axis=1).mean()
-    inside = ((there > before.min(axis=0) - margin) & (there < before.max(axis=0) + margin)).all(axis=1)
+    inside = ((centre_seen > before.min(axis=0) - margin) & (centre_seen < before.max(axis=0) + margin)).all(axis=1)
     # A view direction far from all others would share no surface with them.
     inside &= (poses[:, :3, 2] @ seen_from[:, :3, 2].T).max(axis=1) > _TURNED
     return joints[inside]
@@ -115,18 +115,14 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
     def joined(name: str) -> Array:
         return np.concatenate([getattr(views, name), getattr(more, name)])
 
+    in_all = ("joints", "previous", "approach", "time", "number", "T_base_flange")
     every = replace(
         views,
+        **{name: joined(name) for name in in_all},
         count=views.count + more.count,
         velocity=None if views.velocity is None else joined("velocity"),
         torques=views.torques.followed_by(more.torques),
         covariates={name: np.append(values, more.covariates[name]) for name, values in views.covariates.items()},
-        joints=joined("joints"),
-        previous=joined("previous"),
-        approach=joined("approach"),
-        time=joined("time"),
-        number=np.concatenate([views.number, more.number]),
-        T_base_flange=joined("T_base_flange"),
         axes=views.axes.with_more(more.axes) if views.axes else views.axes,
         gravity=views.gravity if views.gravity.ndim == 1 else joined("gravity"),
     )

@@ -14,16 +14,11 @@ A further view is counted in the frame of the views that there are: less the mea
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from stitch.diagnosis.candidate_views import (
-    candidate_measurement,
-    candidate_rows,
-    nearby,
-    reachable,
-    with_candidates,
-)
+from stitch.diagnosis.candidate_views import candidate_measurement, candidate_rows, nearby, reachable, with_candidates
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.thresholds import ODDS
@@ -88,9 +83,9 @@ class DecidingViews:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival predicts of N further views: a normal distribution of m numbers each, its covariance in three parts.
+    """What a rival predicts that N further views show: m numbers each, jointly normal, their covariance in three parts.
 
-    The numbers are the six of a view's twist, or the residuals of its targets.
+    The m numbers of a view are the six of its twist (surfaces), or the reduced residuals of its targets.
     """
 
     mean: Array  # (N, m)
@@ -99,22 +94,23 @@ class Prediction:
     per_view: Array  # (N, m, m) covariance of what is independent between views, as noise
     design: Array  # (N, m, a) of hand-eye and effects in use
 
-    def of(self, chosen: Sequence[int], more: Indices) -> tuple[Array, Array]:
-        """Return mean (C, D) and covariance (C, D, D) of what C sets of views show: those chosen, and one of `more`.
+    def of_sets(self, chosen: Sequence[int], last: Indices) -> tuple[Array, Array]:
+        """Return mean (C, D) and covariance (C, D, D) of the D numbers that C sets of k views will show, view by view.
 
-        D = m (number chosen + 1).
+        A set is the chosen views and one more, so that D = k m.
 
         Args:
-            chosen: indices of views that are in every set.
-            more: (C,) index of the last view of each set.
+            chosen: indices (k − 1) of the views that are in every set.
+            last: (C,) index of the last view of each set.
         """
-        sets = np.column_stack([np.tile(np.array(chosen, np.int64), (len(more), 1)), more])
+        sets = np.column_stack([np.tile(np.array(chosen, np.int64), (len(last), 1)), last])
         C, k = sets.shape
         m = self.mean.shape[1]
         roots = self.coefficient_root[sets].reshape(C, k * m, -1)
         covariance = roots @ roots.transpose(0, 2, 1)
-        # The same memory by views: what is added to the blocks is added to the covariance.
+        # The same memory, view by view: what is added to the blocks is added to the covariance.
         blocks = covariance.reshape(C, k, m, k, m)
+        # Indices with a slice between them put their axes first: (C, k, k, m, m), and (k, C, m, m).
         if self.shared is not None:
             blocks += self.shared[sets[:, :, None], :, sets[:, None, :]].transpose(0, 1, 3, 2, 4)
         each = np.arange(k)
@@ -262,60 +258,66 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) ->
     share_alone = np.zeros(len(joints))
     while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
-        shares = _decisions(predictions, forms, chosen, indices, draws)[2]
+        shares = _simulate_decisions(predictions, forms, chosen, indices, draws).share
         shares[chosen] = -1.0
         if not chosen:
             share_alone = shares
         k = int(shares.argmax())
         more_draws = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
-        right, _, share = _decisions(predictions, forms, chosen, indices[k : k + 1], more_draws)
-        if share[0] < true_share + _WORTH:
+        decisions = _simulate_decisions(predictions, forms, chosen, indices[k : k + 1], more_draws)
+        if decisions.share[0] < true_share + _WORTH:
             break
         chosen.append(k)
-        probability.append(float(right[0]))
-        true_share = float(share[0])
+        probability.append(float(decisions.right[0]))
+        true_share = float(decisions.share[0])
     return DecidingViews(joints[chosen], wait[chosen], np.array(probability)), share_alone
 
 
-def _decisions(
-    predictions: Sequence[Prediction], forms: RivalForms, chosen: Sequence[int], more: Indices, draws: Array
-) -> tuple[Array, Array, Array]:
-    """Return what will be decided after the chosen views and one of `more` (C,), by simulation: three arrays (C,).
+class _Decisions(NamedTuple):
+    """What C sets of views will decide, (C,) each, on average over the rivals and over what the views may show."""
 
-    They are the probability that the true rival is named, the probability that a wrong one is, and the mean posterior
-    probability of the true one. Each form in turn is taken for the true one, as often as its weight says.
+    right: Array  # probability that the true rival is named
+    wrong: Array  # probability that another one is named
+    share: Array  # posterior probability of the true rival
+
+
+def _simulate_decisions(
+    predictions: Sequence[Prediction], forms: RivalForms, chosen: Sequence[int], last: Indices, draws: Array
+) -> _Decisions:
+    """Return what will be decided after C sets of views, by simulation; each is the chosen views and one of `last`.
+
+    Each form in turn is taken for the true one, as often as its weight says: what a set shows is drawn from its
+    prediction, and held against the predictions of all forms.
 
     Args:
-        draws: (S, D) standard normal numbers, from which what the views show is drawn.
+        predictions: of the F forms.
+        chosen: indices of the views that are in every set.
+        last: (C,) index of the last view of each set.
+        draws: (S, D) standard normal numbers, from which the D numbers that a set shows are drawn S times.
     """
-    moments = [prediction.of(chosen, more) for prediction in predictions]
-    roots = [np.linalg.cholesky(covariance) for _, covariance in moments]
-    inverses = [np.linalg.inv(root) for root in roots]
-    # Half the log determinants of the covariances.
-    log_dets = [np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) for root in roots]
+    sets = [prediction.of_sets(chosen, last) for prediction in predictions]
+    means = [mean for mean, _ in sets]
+    roots = [np.linalg.cholesky(covariance) for _, covariance in sets]
+    whiteners = [np.linalg.inv(root).transpose(0, 2, 1) for root in roots]
+    half_log_dets = np.array([np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1) for root in roots])
+    # Log density of what is shown, by each form: this less half the square of what is shown, whitened.
+    log_heights = forms.log_weights[:, None] - half_log_dets
     weights = np.exp(forms.log_weights - forms.log_weights.max())
     weights = weights / weights.sum()
     rivals = range(int(forms.rival.max()) + 1)
-    right, wrong, share = np.zeros((3, len(more)))
-    for weight, true, (true_mean, _), root in zip(weights, forms.rival, moments, roots, strict=True):
-        observed = true_mean[:, None] + draws @ root.transpose(0, 2, 1)
-        of_forms = np.array(
-            [
-                log_weight
-                - log_det[:, None]
-                - 0.5 * np.sum(((observed - mean[:, None]) @ inverse.transpose(0, 2, 1)) ** 2, axis=2)
-                for log_weight, log_det, (mean, _), inverse in zip(
-                    forms.log_weights, log_dets, moments, inverses, strict=True
-                )
-            ]
-        )
+    right, wrong, share = np.zeros((3, len(last)))
+    for weight, true, true_mean, root in zip(weights, forms.rival, means, roots, strict=True):
+        drawn = true_mean[:, None] + draws @ root.transpose(0, 2, 1)  # (C, S, D)
+        whitened = ((drawn - mean[:, None]) @ whitener for mean, whitener in zip(means, whiteners, strict=True))
+        squares = np.array([np.sum(deviation**2, axis=2) for deviation in whitened])
+        of_forms = log_heights[:, :, None] - 0.5 * squares
         log_posteriors = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
         decided = forms.margins(log_posteriors) > ODDS
         right += weight * decided[true].mean(axis=1)
         others = [r for r in range(forms.named) if r != true]
         wrong += weight * decided[others].any(axis=0).mean(axis=1)
         share += weight * np.exp(log_posteriors[true] - np.logaddexp.reduce(log_posteriors, axis=0)).mean(axis=1)
-    return right, wrong, share
+    return _Decisions(right, wrong, share)
 
 
 def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:

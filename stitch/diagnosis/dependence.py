@@ -221,7 +221,7 @@ def _dependence(
     along = displacement @ direction
     x = law.driver.values
     split = law.driver.name == STEP and int(np.argmax(law.shapes[:, 0] > 0))
-    middle, mean, sigma = bin_means(x, along, split=float(split) - 0.5 if split else None)
+    middle, mean, sigma = bin_means(x, along, float(split) - 0.5 if split else None)
     square = np.sum((column_space(white).T @ linear.white_residual) ** 2)
     # With the noise that no motion of a view makes.
     total_square = float(np.sum(linear.white_residual**2)) + linear.mixed.noise_only[1] / linear.null.variances[NOISE]
@@ -242,19 +242,16 @@ def _dependence(
     )
 
 
-def bin_means(
-    x: Array, y: Array, bins: int = DEPENDENCE_BINS, split: float | None = None
-) -> tuple[Array, Array, Array]:
+def bin_means(x: Array, y: Array, split: float | None) -> tuple[Array, Array, Array]:
     """Return middle, mean and standard error (B,) of values in bins of equal counts, or on both sides of a split.
 
     Args:
         x, y: (V,) abscissa and value of each view, in any units.
-        bins: number of bins; fewer for fewer than two views a bin.
-        split: x at which to divide in two instead; None: bins of equal counts.
+        split: x at which to divide in two; None: up to `DEPENDENCE_BINS` bins of equal counts, of two views at least.
     """
     order = np.argsort(x, kind="stable")
     if split is None:
-        parts = [part for part in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(part)]
+        parts = [part for part in np.array_split(order, min(DEPENDENCE_BINS, max(len(x) // 2, 1))) if len(part)]
     else:
         parts = [order[x[order] < split], order[x[order] > split]]
     # Bins of one or two views have no scatter of their own to speak of: that of all stands in.

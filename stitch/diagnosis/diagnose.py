@@ -69,8 +69,8 @@ def _diagnose(state: RunData) -> Diagnosis:
     announce("diagnosing: errors without a name, and where the error comes from")
     is_unknown = evidence.verdict == "unknown_effect"
     repeating = evidence.repeating_errors or ()
-    if is_unknown and (evidence.repeating_errors is None or evidence.told_laws):
-        repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.told_laws[:1]))
+    if is_unknown and (evidence.repeating_errors is None or evidence.reported_laws):
+        repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.reported_laws[:1]))
     reported = reportable(repeating, evidence.implausible_scatter)
     process = reported[0].process if reported else None
     # The model in which the joint that is reported may err without a name, so that this error is no scatter.
@@ -109,9 +109,9 @@ def _diagnose(state: RunData) -> Diagnosis:
         and (evidence.scanner_error is not None or follows_field(evidence.empirical, repeating)),
         scanner_error=evidence.scanner_error or (find_scanner_error(linear) if is_unknown else None),
         doubts=state.doubts,
-        laws=evidence.told_laws,
+        laws=evidence.reported_laws,
         rival_trend=evidence.rival_trend if evidence.named else "",
-        places=evidence.told_places,
+        places=evidence.reported_places,
         beyond_belief=too_large(evidence.named),
         together=_named_together(evidence),
         tried=state.tried,

@@ -17,6 +17,7 @@ from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, ODDS
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.effects.empirical import FIELD
 from stitch.model.forward import moves_points, scan_correction
+from stitch.model.model import Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space, project_out
@@ -157,24 +158,18 @@ def predicted_distances(
     surfaces = surfaces_of(linear)
     if surfaces is None:
         return None
+    # Without random effects of the arm: poses scatter independently.
     fitted = linear.restricted(())
-    if scored is not None and fitted is not linear:
-        scored = score(fitted, scored.candidate)
     poses = surfaces.capture.poses(fitted.model.T_mount)
     points = [scan.points for scan in surfaces.capture.scans]
-    twists = fitted.design @ fitted.baseline_trial.solve()
-    if scored is not None:
-        X, sums = np.hstack([fitted.design, scored.form.response]), scored.candidate.points
-        solution = fitted.trial(X, None if sums is None else sums.select(scored.form.keep)).solve()
-        k = scored.form.response.shape[1]
-        term = scored.form.at(solution[-k:])
+    if scored is None:
+        twists = fitted.design @ fitted.baseline_trial.solve()
+    else:
+        scored = scored if fitted is linear else score(fitted, scored.candidate)
+        twists, term = _fit_beside_model(fitted, scored)
         if moves_points([term]):
-            # The effect itself moves points of a scan; the views move only by the change of hand-eye and other effects.
-            twists = X[:, :-k] @ solution[:-k]
             corrections = (scan_correction(fitted.measurement, [term], v, T, slice(None)) for v, T in enumerate(poses))
             points = [p + correction for p, correction in zip(points, corrections, strict=True)]
-        else:
-            twists = X @ solution
     overlaps = surfaces.unconstrained.overlaps
     matches = overlaps.matches if matches is None else matches
     centre, of_views = overlaps.gram.centre, twists.reshape(-1, 6)
@@ -182,3 +177,21 @@ def predicted_distances(
     # themselves are not moved: where hand-eye and links imitate each other, both move far, beyond what is linear.
     along = [frames.plane_rows(m.middle - centre, m.normal) @ (of_views[m.v] - of_views[m.w]) for m in matches]
     return signed_distances(matches, poses, points) + np.concatenate(along)
+
+
+def _fit_beside_model(linear: LinearModel, scored: Score) -> tuple[Array, Term]:
+    """Return the twists (6V,) of the views by a fit of hand-eye, effects in use and a candidate, and the fitted effect.
+
+    The twists are left ones about the part's centre, reference frame. Where the candidate moves points of a scan, it
+    moves no view as a whole: then they are those by hand-eye and effects in use.
+    """
+    columns = np.hstack([linear.design, scored.form.response])
+    # Sums over the points that the candidate's free parameters move.
+    points = scored.candidate.points
+    sums = None if points is None else points.select(scored.form.keep)
+    solution = linear.trial(columns, sums).solve()
+    k = scored.form.response.shape[1]
+    term = scored.form.at(solution[-k:])
+    if moves_points([term]):
+        return columns[:, :-k] @ solution[:-k], term
+    return columns @ solution, term

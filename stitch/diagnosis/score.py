@@ -78,14 +78,14 @@ class Score:
 
 @dataclass(frozen=True)
 class FormTrial:
-    """How well one form explains the views; without a fit, only a bound of its log Bayes factor."""
+    """How well one form explains the views, fitted with all variances."""
 
     log_bayes_factor: float
-    p_value: float = 1.0
-    values: Array | None = None  # (p,) fitted freely; None where the form was not worth a fit
-    covariance: Array | None = None  # (p, p)
-    variances: Array | None = None  # (c,) fitted beside it
-    scale: float = 1.0  # likeliest multiple of the plausible sizes
+    p_value: float
+    values: Array  # (p,) fitted freely
+    covariance: Array  # (p, p)
+    variances: Array  # (c,) fitted beside it
+    scale: float  # likeliest multiple of the plausible sizes
 
 
 def score(linear: LinearModel, candidate: Candidate, start: Array | None = None) -> Score:
@@ -106,37 +106,37 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     # Where the scatter has absorbed a gross effect, no plausible size seems observable; yet the effect gains.
     observable = any(seen for _, seen in at_starts) or bool(gains.max() > limits.LOG_BAYES_FACTOR)
     weights = form_weights(candidate)
-    trials = [FormTrial(float(gain)) for gain in gains]
+    trials = dict[int, FormTrial]()
     for i in _forms_to_fit(base, candidate, gains, regime_of(linear).forms_refitted):
         _, scale = at_starts[best_start[i]][0][i]
         variances = starts[best_start[i]].null.variances if start is None else start
         trials[i] = try_form(base, candidate.forms[i], variances, scale)
-    k = max(range(len(trials)), key=lambda i: (trials[i].values is not None, trials[i].log_bayes_factor))
-    best = trials[k]
-    form = candidate.forms[k]
-    log_shares = np.array([trial.log_bayes_factor for trial in trials]) + np.log(weights)
+    # A form without a fit keeps its gain at fixed variances, a lower bound, and a p-value of 1.
+    log_shares = np.array([trials[i].log_bayes_factor if i in trials else gains[i] for i in range(len(gains))])
+    log_shares = log_shares + np.log(weights)
     log_bayes_factor = float(logsumexp(log_shares))
-    p_value = float(min(1.0, np.min(np.array([trial.p_value for trial in trials]) / weights)))
-    values = np.zeros(len(form.sizes))
-    covariance = np.diag(values + np.nan)
-    if best.values is not None and best.covariance is not None:
-        values, covariance = best.values, best.covariance
-        if not observable:
-            p_value, log_bayes_factor = 1.0, 0.0
-    base_model = None
-    if regime_of(base).prior and best.variances is not None:
-        base_model = replace(base, null=at_variances(base.mixed, best.variances))
+    p_values = [trials[i].p_value if i in trials else 1.0 for i in range(len(gains))]
+    p_value = float(min(1.0, np.min(np.array(p_values) / weights)))
+    if not trials:
+        form = candidate.forms[int(gains.argmax())]
+        nothing = np.zeros(len(form.sizes))
+        unknown = np.diag(nothing + np.nan)
+        return Score(candidate, observable, form, p_value, log_bayes_factor, nothing, unknown, log_shares=log_shares)
+    if not observable:
+        p_value, log_bayes_factor = 1.0, 0.0
+    k = max(trials, key=lambda i: trials[i].log_bayes_factor)
+    best = trials[k]
     return Score(
         candidate,
         observable,
-        form,
+        candidate.forms[k],
         p_value,
         log_bayes_factor,
-        values=values,
-        covariance=covariance,
-        scale=best.scale,
-        variances=best.variances,
-        base_model=base_model,
+        best.values,
+        best.covariance,
+        best.scale,
+        best.variances,
+        base_model=replace(base, null=at_variances(base.mixed, best.variances)) if regime_of(base).prior else None,
         log_shares=log_shares,
     )
 
@@ -189,20 +189,29 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         free = fit_variances(mixed, G, wide, integrated.variances)
     a = mixed.A.shape[2]
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
-    # θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does.
+    p_value = _wald_p_value(linear, form, theta, covariance)
+    log_bayes_factor = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(deviances.values())), scales)
+    return FormTrial(log_bayes_factor, p_value, theta, covariance, integrated.variances, scale)
+
+
+def _wald_p_value(linear: LinearModel, form: Form, theta: Array, covariance: Array) -> float:
+    """Return the p-value of θᵀ C⁻¹ θ, over the combinations of parameters of which the views say more than the prior.
+
+    Args:
+        theta: (p,) values θ of the form's parameters, under the wide prior of `FREE_SIZES` plausible sizes.
+        covariance: C (p, p) of these.
+    """
     values, vectors = np.linalg.eigh(covariance / np.outer(form.sizes, form.sizes))
     seen = values < 0.5 * limits.FREE_SIZES**2
     square = float(np.sum((vectors[:, seen].T @ (theta / form.sizes)) ** 2 / np.maximum(values[seen], 1e-300)))
     rank = int(seen.sum())
     # The scatter along the columns of a form is known to fewer degrees of freedom than numbers are left, where views
     # tell several components apart; among very many numbers to as many.
-    degrees_of_freedom: float = max(mixed.size - a - rank, 1)
-    if not regime.one_scale_is_enough:
+    degrees_of_freedom: float = max(linear.mixed.size - linear.mixed.A.shape[2] - rank, 1)
+    if not regime_of(linear).one_scale_is_enough:
         white = linear.in_blocks(linear.residual(form.columns))
         degrees_of_freedom = max(linear.satterthwaite.degrees_of_freedom(white), 1.0)
-    p_value = f_tail(square / max(rank, 1), max(rank, 1), degrees_of_freedom)
-    log_bayes_factor = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(deviances.values())), scales)
-    return FormTrial(log_bayes_factor, p_value, theta, covariance, integrated.variances, scale)
+    return f_tail(square / max(rank, 1), max(rank, 1), degrees_of_freedom)
 
 
 def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) -> list[tuple[Candidate, float]]:

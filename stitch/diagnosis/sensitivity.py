@@ -12,6 +12,7 @@ evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter 
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 from scipy.optimize import brentq
@@ -23,9 +24,10 @@ from stitch.diagnosis.score import Score, form_weights
 from stitch.model.forward import PointSlopes, moves_points
 from stitch.numerics import frames
 from stitch.numerics.distributions import f_limit, noncentral_f_tail
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel
+from stitch.session.scan import even_indices
 
 # Views and points of each that show how an effect bends the scans (time).
 _SHAPE_VIEWS, _SHAPE_POINTS = 5, 300
@@ -55,17 +57,14 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     return matrix
 
 
-def aliases_of(
-    k: int, matrix: Array, scores: Sequence[Score], least: float = limits.LISTED_ALIAS_CORRELATION
-) -> dict[str, float]:
+def aliases_of(k: int, matrix: Array, scores: Sequence[Score]) -> dict[str, float]:
     """Return up to five effects that look most like candidate k, with their correlation, largest first.
 
     Args:
         matrix: (K, K) alias matrix (`alias_matrix`).
         scores: of the K candidates, in its order.
-        least: correlation from which an effect is listed.
     """
-    alike = [j for j in np.argsort(-matrix[k]) if j != k and matrix[k, j] > least]
+    alike = [j for j in np.argsort(-matrix[k]) if j != k and matrix[k, j] > limits.LISTED_ALIAS_CORRELATION]
     return {scores[j].name: float(matrix[k, j]) for j in alike[:5]}
 
 
@@ -137,9 +136,9 @@ def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: di
     slopes = PointSlopes(measurement, [term], linear.model)
     poses = measurement.capture.poses(linear.model.T_mount)
     squares = []
-    for v in _spread(len(poses), _SHAPE_VIEWS):
+    for v in even_indices(len(poses), _SHAPE_VIEWS):
         scan = measurement.capture.scans[v]
-        index = _spread(len(scan.points), _SHAPE_POINTS)
+        index = even_indices(len(scan.points), _SHAPE_POINTS)
         points, normals = scan.points[index], scan.normals[index]
         along = np.einsum("pni,ni->np", slopes.at(v, poses[v], index), normals)
         moves = column_space(np.hstack([np.cross(points, normals), normals]))
@@ -148,17 +147,8 @@ def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: di
     return float(np.max(np.sqrt(np.mean(squares, axis=0)) * sizes))
 
 
-def _spread(count: int, most: int) -> Indices:
-    """Return at most so many indices, evenly spread over 0 … count − 1."""
-    return np.unique(np.linspace(0, count - 1, most).astype(int))
-
-
 def least_noncentrality(
-    white: Array,
-    weight: float,
-    tests: int,
-    degrees_of_freedom: float,
-    scales: Mapping[float, float],
+    white: Array, weight: float, tests: int, degrees_of_freedom: float, scales: Mapping[float, float]
 ) -> float:
     """Return the least noncentrality λ = θᵀIθ at which an effect is detected with probability `POWER`.
 
@@ -223,21 +213,26 @@ def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> d
         tests: number of candidates among which one would be named.
     """
     linear = linear.without([candidate.name])
-    sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
     scatter, scales = linear.satterthwaite, regime_of(linear).scales
     has_singles = any(form.keep.sum() == 1 for form in candidate.forms)
-    reduced, whole, alone = None, np.zeros((0, 0)), np.zeros(0)
-    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        if reduced is not form.reduced:  # forms of one term follow each other
-            reduced, whole = form.reduced, linear.residual(form.reduced)
-            alone = scatter.of_each(linear.in_blocks(whole)) if has_singles else alone
-        white = whole[:, form.keep]
-        names = tuple(p.name for p in form.free)
-        is_single = len(names) == 1
-        known = float(alone[form.keep][0]) if is_single else scatter.degrees_of_freedom(linear.in_blocks(white))
-        least = least_noncentrality(white * form.sizes, float(weight), tests, known, scales)
-        for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
-            size = float(np.sqrt(least) / length) if length > 0 else float("inf")
-            sizes.setdefault(name, {}).setdefault(names, []).append(size)
+    weights = iter(form_weights(candidate).tolist())
+    # By parameter, and by the parameters that a form has free, the sizes in each such form.
+    sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
+    for _, forms in groupby(candidate.forms, key=lambda form: id(form.term)):
+        of_term = list(forms)
+        # All columns of the term, whitened, and the degrees of freedom of the scatter along each.
+        whole = linear.residual(of_term[0].reduced)
+        degrees_alone = scatter.of_each(linear.in_blocks(whole)) if has_singles else None
+        for form in of_term:
+            white = whole[:, form.keep]
+            if degrees_alone is not None and form.keep.sum() == 1:
+                degrees = float(degrees_alone[form.keep][0])
+            else:
+                degrees = scatter.degrees_of_freedom(linear.in_blocks(white))
+            least = least_noncentrality(white * form.sizes, next(weights), tests, degrees, scales)
+            names = tuple(p.name for p in form.free)
+            for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
+                size = float(np.sqrt(least) / length) if length > 0 else float("inf")
+                sizes.setdefault(name, {}).setdefault(names, []).append(size)
     # Forms of the same parameters differ in when something happened: any of them could be true.
     return {name: min(float(np.median(of_form)) for of_form in forms.values()) for name, forms in sizes.items()}

@@ -15,11 +15,12 @@ from stitch.diagnosis import thresholds as limits
 from stitch.effects.contract import EFFECTS
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import term_of
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array
 from stitch.numerics.kernels import REACH, SHORT_REACH, exponential_kernel, rbf_joints
 from stitch.numerics.reml import VarianceFit, fit_variances
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY, flange_twists, time_in_steps
+from stitch.session.scan import even_indices
 
 # Below this share of the largest variance nothing is left of a covariance.
 _ROUNDING = 1e-8
@@ -123,7 +124,7 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
     """Return the process of a flange that wanders in time, with an exponential covariance between views."""
     measurement = linear.measurement
     time = time_in_steps(measurement)
-    knots = _knots(len(time))
+    knots = even_indices(len(time), limits.PROCESS_KNOTS)
     covariance = exponential_kernel(time, time[knots], DRIFT_MEMORY["slowly wandering"])
     motions = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return SmoothProcess(None, motions, covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS // 6))
@@ -207,12 +208,7 @@ def _smooth_trends(angles: Array, reach: float = REACH) -> Array:
 def _smooth_trends_of(angles: bytes, views: int, reach: float) -> Array:
     """Return the trends of `_smooth_trends`, cached by the bytes of the angles: every diagnosis asks for them."""
     of_views = np.frombuffer(angles).reshape(views, -1)
-    knots = _knots(views)
+    knots = even_indices(views, limits.PROCESS_KNOTS)
     covariance = rbf_joints(of_views, of_views[knots], reach)
     shapes = covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS)
     return shapes - shapes.mean(axis=0)
-
-
-def _knots(views: int) -> Indices:
-    """Return the indices of the views that stand for all in an eigenproblem: at most `PROCESS_KNOTS`, evenly chosen."""
-    return np.unique(np.linspace(0, views - 1, min(views, limits.PROCESS_KNOTS)).astype(np.int64))

@@ -22,13 +22,7 @@ from stitch.diagnosis.candidates import Candidate, candidate_as_fitted, candidat
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
-from stitch.diagnosis.validation import (
-    Extrapolation,
-    cross_validate,
-    extrapolate,
-    group_share,
-    untested_ends_reason,
-)
+from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, group_share, untested_ends_reason
 from stitch.fit.pipelines import linearise
 from stitch.model.model import Term
 from stitch.numerics.parameter_selection import (
@@ -153,21 +147,20 @@ def _stable_selection(
     """
     remaining = list(candidates)
     exchanged = set[str]()
-    unseen = set[str]()
+    # Effects removed at ends that change as little with as without them.
+    untested = set[str]()
     refused = dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
         chosen, end_tests = _eliminate_backward(linear, chosen, len(remaining))
-        tests = zip(chosen, end_tests.values(), strict=True)
-        erring = [(r, at_ends) for r, at_ends in tests if at_ends is not None and not at_ends.helps]
-        erring.sort(key=lambda pair: -pair[1].share)
-        worst = next((pair for pair in erring if not _helps_beside_next(linear, remaining, chosen, pair[0])), None)
+        worst = _worst_at_ends(linear, remaining, chosen, end_tests)
         replacements = list[Ranked]()
         if worst is not None:
-            name, at_ends = worst[0].name, worst[1]
+            name, at_ends = worst
             refused[name] = at_ends.rejection_reason(name)
-            unseen -= {name}
-            unseen |= {name} if at_ends.unseen else set()
+            untested -= {name}
+            if at_ends.unseen:
+                untested.add(name)
         else:
             rivals = [c for c in candidates if c.name not in exchanged]
             exchange = find_exchange(linear, rivals, chosen, end_tests)
@@ -178,14 +171,36 @@ def _stable_selection(
             refused.pop(replacement.name, None)  # it erred beside the one that gives way
             refused[name] = reason
             exchanged.add(name)
-            unseen -= {name, replacement.name}
+            untested -= {name, replacement.name}
         remaining = [c for c in remaining if c.name != name]
         kept = [r for r in chosen if r.name != name]
         chosen = _add_effects(linear, remaining, [*kept, *replacements])
-    if len(unseen) > 1:
-        refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
+    if len(untested) > 1:
+        refused |= dict.fromkeys(untested, untested_ends_reason(sorted(untested)))
     likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
     return ForwardSelection(likeliest_first, explained, refused)
+
+
+def _worst_at_ends(
+    linear: LinearModel,
+    candidates: Sequence[Candidate],
+    chosen: Sequence[Ranked],
+    end_tests: Mapping[str, Extrapolation | None],
+) -> tuple[str, Extrapolation] | None:
+    """Return the name of the chosen effect that errs most at ends of joint ranges, and its test; None if all may stay.
+
+    An effect may stay that helps there, alone or beside the likeliest further effect (`_helps_beside_next`).
+
+    Args:
+        candidates: further effects.
+        end_tests: by name, the test of each chosen effect at the ends.
+    """
+    tests = ((r, end_tests[r.name]) for r in chosen)
+    erring = [(r, at_ends) for r, at_ends in tests if at_ends is not None and not at_ends.helps]
+    for r, at_ends in sorted(erring, key=lambda pair: -pair[1].share):
+        if not _helps_beside_next(linear, candidates, chosen, r):
+            return r.name, at_ends
+    return None
 
 
 def _helps_beside_next(

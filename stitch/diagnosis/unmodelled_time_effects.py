@@ -389,7 +389,7 @@ def _error_kinds(linear: LinearModel) -> list[RepeatingError]:
     """
     assert linear.pose_errors is not None
     names = linear.pose_errors.names
-    of_arm = tuple(name for name, own in zip(names, linear.pose_errors.arm_components, strict=True) if own)
+    of_arm = tuple(name for name, is_of_arm in zip(names, linear.pose_errors.arm_components, strict=True) if is_of_arm)
     kinds = {
         _FOLLOW_JOINTS: of_arm,
         _WANDER_IN_TIME: tuple(DRIFT_MEMORY),

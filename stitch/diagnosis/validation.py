@@ -241,23 +241,28 @@ def untested_ends_reason(names: Sequence[str]) -> str:
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     """Return how well a candidate predicts views at the ends of joint ranges, each end from all other views.
 
-    A share is the sum of squares that a fit with the candidate leaves there, over that of a fit without it; below 1 it
-    helps. None where the views are too few to leave an end out.
+    The views at each end are left out in turn, and predicted by a fit with the candidate and by one without it. Shares
+    are the sum of squares with it over that without: below 1 it helps. None where the views are too few to leave an end
+    out.
     """
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:
         return None
     trial = linear.trial(np.hstack([linear.design, scored.form.response]))
-    priors = _end_priors(linear, scored, trial)
-    squares = [[trial.squares(x, end.views) for x in trial.solve_each(priors, end.views)] for end in ends]
-    shares = [mean_square_share(with_effect, without) for with_effect, without in squares]
+    with_effect, without = _end_priors(linear, scored, trial)
+    # Of each end, and for each of the two fits, the squares (views of the end,) that are left.
+    squares = [
+        [trial.squares(x, end.views) for x in trial.solve_each([with_effect, without], end.views)] for end in ends
+    ]
+    shares = [mean_square_share(*of_end) for of_end in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
-    total = mean_square_share(*np.array([[of_end.sum() for of_end in row] for row in squares]).T)
+    share, sigma = mean_square_share(*np.array([[of_fit.sum() for of_fit in of_end] for of_end in squares]).T)
     # The ends are samples of log shares: a further one is better with the probability that its log is below zero.
     logs = np.log([max(share, 1e-300) for share, _ in shares])
     spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
     likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
-    return Extrapolation(*total, ends[worst], *shares[worst], likely)
+    worst_share, worst_sigma = shares[worst]
+    return Extrapolation(share, sigma, ends[worst], worst_share, worst_sigma, likely)
 
 
 def _end_priors(linear: LinearModel, scored: Score, trial: LinearTrial) -> tuple[CoefficientPrior, CoefficientPrior]:

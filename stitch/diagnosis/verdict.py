@@ -83,7 +83,7 @@ class Evidence:
         return "unknown_effect" if unexplained or scanner_errs or self.overlap_misfit > 0 else "adequate"
 
     @property
-    def told_laws(self) -> tuple[Ranked, ...]:
+    def reported_laws(self) -> tuple[Ranked, ...]:
         """Laws of the dictionary that are reported.
 
         If something is named, they are its rivals. Otherwise they are the best law, if it stands out, and all within
@@ -98,12 +98,12 @@ class Evidence:
         return near if len(near) <= limits.MOST_LAWS else ()
 
     @property
-    def told_places(self) -> tuple[str, ...]:
+    def reported_places(self) -> tuple[str, ...]:
         """Places of the laws within 20 to 1 of the best, where these laws are too many to be reported themselves.
 
         () if there are also too many places.
         """
-        if self.verdict != "unknown_effect" or self.told_laws or not self.laws or not stands_out(self.laws[0]):
+        if self.verdict != "unknown_effect" or self.reported_laws or not self.laws or not stands_out(self.laws[0]):
             return ()
         least = self.laws[0].log_posterior - limits.ODDS
         places = dict.fromkeys(law_of(r).place.name for r in self.laws if r.log_posterior > least)

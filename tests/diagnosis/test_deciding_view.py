@@ -27,7 +27,8 @@ from stitch.diagnosis.deciding_view import (
     unnamed_joints,
 )
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.diagnosis.effect_trend import EffectTrend, expected_in_view, trend_in_model, trends_of_candidates
+from stitch.diagnosis.effect_trend import expected_in_view, trend_in_model, trends_of_candidates
+from stitch.diagnosis.fitted_effect import EffectTrend
 from stitch.diagnosis.score import score
 from stitch.diagnosis.thresholds import ODDS
 from stitch.effects.contract import EFFECTS, parameters_in
@@ -58,7 +59,7 @@ def test_the_odds_of_two_rivals_that_differ_in_one_number_are_those_of_the_close
     """The log likelihood ratio of two normals δ sigmas apart is itself normal: mean δ²/2, variance δ²."""
     draws = np.random.default_rng(0).standard_normal((40_000, 1))
     rivals = [prediction(0.0, 0.02), prediction(0.02 * apart, 0.02)]
-    right, wrong, _ = deciding_view._decisions(rivals, alike(2), [], np.zeros(1, int), draws)
+    right, wrong, _ = deciding_view._simulate_decisions(rivals, alike(2), [], np.zeros(1, int), draws)
     assert right[0] == pytest.approx(norm.cdf((apart**2 / 2 - ODDS) / apart), abs=0.01)
     assert wrong[0] == pytest.approx(norm.cdf((-(apart**2) / 2 - ODDS) / apart), abs=0.005)
 
@@ -66,7 +67,7 @@ def test_the_odds_of_two_rivals_that_differ_in_one_number_are_those_of_the_close
 def test_a_view_in_which_the_rivals_expect_the_same_decides_nothing():
     draws = np.random.default_rng(0).standard_normal((1000, 1))
     rivals = [prediction(0.1, 0.02), prediction(0.1, 0.02)]
-    right, wrong, share = deciding_view._decisions(rivals, alike(2), [], np.zeros(1, int), draws)
+    right, wrong, share = deciding_view._simulate_decisions(rivals, alike(2), [], np.zeros(1, int), draws)
     assert (right[0], wrong[0], share[0]) == (0.0, 0.0, 0.5)
 
 
@@ -75,7 +76,7 @@ def test_a_rival_that_may_take_the_form_of_another_leaves_that_one_unnamed():
     draws = np.random.default_rng(0).standard_normal((20_000, 1))
     predictions = [prediction(0.0, 0.02), prediction(0.0, 0.02), prediction(0.4, 0.02)]
     forms = RivalForms([], np.log([0.5, 0.25, 0.25]), np.array([0, 1, 1]), np.zeros(2), 2)
-    right, wrong, share = deciding_view._decisions(predictions, forms, [], np.zeros(1, int), draws)
+    right, wrong, share = deciding_view._simulate_decisions(predictions, forms, [], np.zeros(1, int), draws)
     assert right[0] == pytest.approx(0.25, abs=1e-3) and wrong[0] == 0.0
     assert share[0] == pytest.approx(0.5 * 2 / 3 + 0.25 / 3 + 0.25, abs=1e-3)
 
@@ -87,10 +88,10 @@ def test_what_is_believed_of_a_rival_makes_it_harder_to_name_and_the_other_no_ea
     for true, harder in ((0, 0.0), (1, np.log(25.0))):
         weights = np.where(np.arange(2) == true, 0.0, -50.0)
         forms = RivalForms([], weights, np.arange(2), belief, 2)
-        right, *_ = deciding_view._decisions(rivals, forms, [], np.zeros(1, int), draws)
+        right, *_ = deciding_view._simulate_decisions(rivals, forms, [], np.zeros(1, int), draws)
         # The weights take the other for out of the question by 50 nats: what is left to decide is that less.
         fair = replace(forms, log_belief=belief * 0)
-        assert right[0] == deciding_view._decisions(rivals, fair, [], np.zeros(1, int), draws)[0][0]
+        assert right[0] == deciding_view._simulate_decisions(rivals, fair, [], np.zeros(1, int), draws)[0][0]
         ahead = np.array([[3.5], [0.0]]) if true == 0 else np.array([[0.0], [3.5]])
         assert forms.margins(ahead)[true, 0] == pytest.approx(3.5 - harder)
 
@@ -123,7 +124,7 @@ def test_what_is_expected_of_a_further_view_is_what_it_shows_within_what_is_know
     model = build_capture("all", (), measured.T_base_flange, linear.measurement.mount).poses(linear.model.T_mount)
     twists = frames.log(to_centre @ measured.T_reference_scanner @ frames.inverse(to_centre @ model))
     seen = twists[VIEWS:] - twists[:VIEWS].mean(axis=0)
-    mean, covariance = expected.of([0, 1], np.array([2]))
+    mean, covariance = expected.of_sets([0, 1], np.array([2]))
     off = seen.ravel() - mean[0]
     square = off @ np.linalg.solve(covariance[0], off)
     # 18 numbers: a chi square beyond 42 has a chance of one in a thousand.
@@ -153,7 +154,7 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
     forms = competing_forms(scores, weights, unnamed=unnamed_joints(found.linear, scores))
     tried = predict_views(found.linear, forms.scores, joints, np.zeros(len(joints)))
     draws = np.random.default_rng(5).standard_normal((2000, 6))
-    right = deciding_view._decisions(tried, forms, [], np.arange(len(joints)), draws)[0]
+    right = deciding_view._simulate_decisions(tried, forms, [], np.arange(len(joints)), draws)[0]
     assert views.probability[0] > right.max() - 0.05
 
 
