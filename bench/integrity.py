@@ -282,7 +282,7 @@ def snooped(session: SessionData, T_mount: Array) -> Snooping:
     gate = overlaps[0].gate
     views = unconstrained_poses(capture, capture.poses(T_mount), gate)
     usual = UsualEffects(measurement_of(session, capture), Model(T_mount))
-    return apply_displacement_limits(session, snoop_views(capture, T_mount, gate, views, usual))
+    return apply_displacement_limits(session, snoop_views(capture, T_mount, views, usual))
 
 
 def good_summary(rows: list[Row]) -> list[str]:

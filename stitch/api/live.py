@@ -404,24 +404,22 @@ class LiveSession:
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
         sure = find_blunders(model.with_usual(usual)).blunders
         blunders = [v for v in search.blunders if v in sure]
-        sentences = {v: self._displacement(fit, model, search, v, [w for w in blunders if w != v]) for v in blunders}
+        search = replace(search, blunders=tuple(blunders))
+        sentences = {v: self._displacement(fit, model, search, v) for v in blunders}
         return {v: sentence for v, sentence in sentences.items() if sentence is not None}
 
-    def _displacement(
-        self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]
-    ) -> str | None:
+    def _displacement(self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int) -> str | None:
         """Return a sentence on the least error of a view's pose that agrees with the scans; None where that may be 0.
 
         The error is a rotation (rad) and the shift of the middle of the view's points (length_unit).
 
         Args:
             model: linear model of the views' pose errors.
-            search: result of the search for wrong poses in `model`, with the scatter of the poses.
+            search: the views whose poses are wrong by `model`, and the scatter of the poses.
             view: index of the view in the fit.
-            others: indices of the other views whose poses are wrong; they are left free.
         """
         middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
-        rotation, shift = least_displacement(model, search, others, (), view, middle)
+        rotation, shift = least_displacement(model, search, view, middle)
         if shift == 0 and rotation <= _SMALLEST_TURN:
             return None
         turn = f" and {1e3 * rotation:.2g} mrad" if rotation > _SMALLEST_TURN else ""

@@ -6,6 +6,7 @@ did. A cable, a clamp or an operator's arm belongs to nothing: it stands where o
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -14,7 +15,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.matching import sample_points
 from stitch.screening.linkage import points_in_place
-from stitch.session.scan import Scan
+from stitch.session.scan import Scan, even_indices
 
 # Points of a scan that are asked whether they are in the way, and other scans, all over the session, asked for each.
 _OCCLUDER_PROBES, _OCCLUDER_VIEWS = 400, 20
@@ -53,25 +54,27 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> tuple[tup
     """
     views = [v for v, scan in enumerate(scans) if len(scan.points)]
     # A tree is built only for scans that are needed: most are not.
-    look_into = cache(lambda w: _ray_tree(scans[w]))
+    ray_tree_of = cache(lambda w: _ray_tree(scans[w]))
     shares = {}
     for v in views:
-        asked = _evenly([w for w in views if w != v], _OCCLUDER_VIEWS)
+        others = [w for w in views if w != v]
+        sample = [others[i] for i in even_indices(len(others), _OCCLUDER_VIEWS)]
         points = scans[v].points[sample_points(scans[v], _OCCLUDER_PROBES)]
-        seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
-        apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
+        seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in sample}
+        clearance = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in sample}
         # Points that no other scan shows: most drop out with the first scans.
         alone = points
-        for w in asked:
-            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+        for w in sample:
+            in_other = np.ascontiguousarray(frames.transform(seen_from[w], alone))
             if len(alone):
-                shown, _ = scans[w].tree.query(there, k=1, distance_upper_bound=apart[w])
-                alone = alone[shown >= apart[w]]
-        through = np.zeros(len(alone), bool)
-        for w in asked if len(alone) >= _FEWEST else ():
-            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
-            through |= _looks_through(scans[w], look_into(w), there, apart[w])
-        shares[v] = through.sum() / len(points) if through.sum() >= _FEWEST else 0.0
+                distance, _ = scans[w].tree.query(in_other, k=1, distance_upper_bound=clearance[w])
+                alone = alone[distance >= clearance[w]]
+        is_looked_through = np.zeros(len(alone), bool)
+        for w in sample if len(alone) >= _FEWEST else ():
+            in_other = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+            is_looked_through |= _looks_through(scans[w], ray_tree_of(w), in_other, clearance[w])
+        count = is_looked_through.sum()
+        shares[v] = count / len(points) if count >= _FEWEST else 0.0
     showing = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
     return (showing, float(np.mean([shares[v] for v in showing]))) if showing else None
 
@@ -79,11 +82,6 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> tuple[tup
 def _ray_tree(scan: Scan) -> KDTree:
     """Return the search tree over the directions in which a scan sees its points."""
     return KDTree(scan.rays(scan.points))
-
-
-def _evenly(views: Sequence[int], count: int) -> list[int]:
-    """Return so many of some views at most, all over the list."""
-    return [int(views[i]) for i in np.linspace(0, len(views) - 1, min(len(views), count)).astype(int)]
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
@@ -125,13 +123,19 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
     return gaps.max(axis=1, initial=0.0) < np.pi
 
 
+class StaticBackground(NamedTuple):
+    """What stands still before the scanner whatever the arm did; boxes are two corners, scanner frame."""
+
+    share: float  # of all points
+    views: tuple[int, ...]  # that show it
+    box: Array  # (2, 3)
+    within: Array | None  # (2, 3) with the part and without the background; None: no axis-parallel plane parts the two
+
+
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
-) -> tuple[float, tuple[int, ...], Array, Array | None] | None:
+) -> StaticBackground | None:
     """Return what stands still before the scanner whatever the arm did; None if it is too little.
-
-    Returned are its share of all points, the views that show it, its box (2, 3) (lowest and highest corner, scanner
-    frame), and a box (2, 3) with the part and without it, None where no axis-parallel plane separates them.
 
     A point stands still if most views whose pose moves it show it at the same place before the scanner. A panel that
     slides along itself, or a disc that turns about its axis, does so too; but under the model other views show it where
@@ -149,14 +153,14 @@ def find_static_background(
         # Points that most of the others show at the same place before the scanner.
         others = [scans[w] for w in _views_moving_points(points[v], poses, v, size)]
         normals = scan.normals[probes[v]]
-        shown = [points_in_place(other, points[v], normals, tolerance) for other in others]
-        stays.append(np.mean(shown, axis=0) > 0.5 if len(others) >= _LEAST else np.zeros(len(points[v]), bool))
+        shows_it = [points_in_place(other, points[v], normals, tolerance) for other in others]
+        stays.append(np.mean(shows_it, axis=0) > 0.5 if len(others) >= _LEAST else np.zeros(len(points[v]), bool))
     still = np.concatenate(stays)
     if still.mean() < _BACKGROUND_MIN_SHARE:
         return None
     looks = [_ray_tree(scan) for scan in scans]
-    judged = [_under_model(scans, looks, poses, (v, index), tolerance) for v, index in enumerate(probes)]
-    on_part = np.concatenate([shown for shown, _ in judged])
+    judged = [_under_model(scans, looks, poses, v, index, tolerance) for v, index in enumerate(probes)]
+    on_part = np.concatenate([in_place for in_place, _ in judged])
     through = np.concatenate([looked_through for _, looked_through in judged])
     if np.sum(still & through & ~on_part) < max(_THROUGH, _ODDS * np.sum(still & on_part)):
         return None
@@ -164,7 +168,7 @@ def find_static_background(
     views = tuple(v for v, mask in enumerate(stays) if mask.any())
     background = every[still & ~on_part]
     within = _box_beyond_part(every[on_part & ~still], background, _bounding_box(every), size)
-    return float(np.mean(still & ~on_part)), views, _bounding_box(background), within
+    return StaticBackground(float(np.mean(still & ~on_part)), views, _bounding_box(background), within)
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
@@ -179,23 +183,23 @@ def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> li
     """
     if not len(points):
         return []
-    there = frames.transform(frames.inverse(poses) @ poses[v], points[None])
-    far = np.flatnonzero(np.median(np.linalg.norm(there - points, axis=2), axis=1) > _MOVED * size)
-    return _evenly(far.tolist(), _BACKGROUND_VIEWS)
+    in_others = frames.transform(frames.inverse(poses) @ poses[v], points[None])
+    far = np.flatnonzero(np.median(np.linalg.norm(in_others - points, axis=2), axis=1) > _MOVED * size)
+    return far[even_indices(len(far), _BACKGROUND_VIEWS)].tolist()
 
 
 def _under_model(
-    scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, probes: tuple[int, Indices], tolerance: float
+    scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, v: int, index: Indices, tolerance: float
 ) -> tuple[Mask, Mask]:
     """Return two masks (n,) of some points of a view: another view shows it at its place, another view looks past it.
 
     Args:
         looks: per view a tree over the directions of its points.
         poses: (V, 4, 4) T_reference_scanner by the model.
-        probes: the view, and the numbers (n,) of its points to test.
+        v: number of the view.
+        index: numbers (n,) of its points to test.
         tolerance: distance along the normal that is the same place, length_unit.
     """
-    v, index = probes
     on_part = np.zeros(len(index), bool)
     through = np.zeros(len(index), bool)
     for w, scan in enumerate(scans):

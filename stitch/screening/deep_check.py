@@ -111,15 +111,15 @@ def _check_views(
     Args:
         ranked: hypotheses about the poses, for a hand-eye to begin with.
     """
-    T_mount, snooping = _snoop_from_start(session, capture, *_starting_hand_eye(session, capture, ranked))
-    while stock := find_stock(session, capture, T_mount, snooping):
+    snooping = _snoop_from_start(session, capture, *_starting_hand_eye(session, capture, ranked))
+    while stock := find_stock(session, snooping):
         capture = capture.without_stock(stock)
-        T_mount, snooping = _snoop_from_start(session, capture, T_mount, snooping.unconstrained.overlaps.gate)
+        snooping = _snoop_from_start(session, capture, snooping.T_mount, snooping.unconstrained.overlaps.gate)
     columns = snooping.blunder_search.mean_columns
     lengths = length_problem(snooping.model, capture.T_reference_mount, columns)
     if lengths is not None:
         return [lengths], False
-    problems = explain_misplaced(session, capture, T_mount, snooping)
+    problems = explain_misplaced(session, snooping)
     contradicted = poses_contradict_scans(session, snooping) and not any(p.kind == "disconnected" for p in problems)
     rounding = rounding_that_explains(session, snooping)
     if rounding is not None:
@@ -132,7 +132,7 @@ def _check_views(
         off = suspicion_in_words(session, m)
         problems.append(problem("suspected", [session.names[m.view]], certain=False, off=off))
     problems += stock_problems(session, capture)
-    return problems + background_problems(session, capture, T_mount, snooping), contradicted
+    return problems + background_problems(session, snooping), contradicted
 
 
 def _starting_hand_eye(session: SessionData, capture: Capture, ranked: Sequence[MotionFit]) -> tuple[Array, float]:
@@ -150,19 +150,18 @@ def _starting_hand_eye(session: SessionData, capture: Capture, ranked: Sequence[
     return coarse.T_mount, coarse.gate
 
 
-def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, gate: float) -> tuple[Array, Snooping]:
-    """Return the hand-eye (4, 4) refined from a start by ICP, and what the tests of the views find under it.
+def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, gate: float) -> Snooping:
+    """Return what the tests of the views find under a hand-eye refined by ICP.
 
     Args:
+        T_mount: (4, 4) hand-eye to begin with.
         gate: largest distance between corresponding points at first, length_unit.
     """
     T_mount, overlaps, _ = icp_hand_eye([capture], T_mount, [gate])
     require_near_scanner([capture], T_mount)
-    gate = overlaps[0].gate
-    unconstrained = unconstrained_poses(capture, capture.poses(T_mount), gate)
+    unconstrained = unconstrained_poses(capture, capture.poses(T_mount), overlaps[0].gate)
     usual = UsualEffects(measurement_of(session, capture), Model(T_mount))
-    snooping = snoop_views(capture, T_mount, gate, unconstrained, usual)
-    return T_mount, apply_displacement_limits(session, snooping)
+    return apply_displacement_limits(session, snoop_views(capture, T_mount, unconstrained, usual))
 
 
 def _likely_mistake(session: SessionData, capture: Capture, ranked: Sequence[MotionFit]) -> SessionProblem | None:
@@ -186,7 +185,7 @@ def _surfaces_agree(session: SessionData, capture: Capture, fit: SurfaceFit) -> 
     right = replace(session, mount=h.mount, views=views)
     gate = _GATE * part_size([capture])
     try:
-        _, snooping = _snoop_from_start(right, thin_session(right, _POINTS)[1], fit.T_mount, gate)
+        snooping = _snoop_from_start(right, thin_session(right, _POINTS)[1], fit.T_mount, gate)
     except NoResultError:
         return False
     return not poses_contradict_scans(right, snooping)

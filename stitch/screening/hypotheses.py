@@ -483,7 +483,11 @@ def distinct(tried: Sequence[Hypothesis], angle: float, length: float) -> list[H
 
 
 def known_unit_ratio(scale: float, sigma: float = 0.0) -> float | None:
-    """Return the factor of `UNITS` that a fitted scale is, None where it is none."""
+    """Return the factor of `UNITS` that a fitted scale is, None where it is none.
+
+    Args:
+        sigma: standard error of `scale`: within three of it the two may differ, but by no more than `_UNIT_FAR`.
+    """
     if scale <= 0:
         return None
     factor = min(UNITS, key=lambda unit: abs(np.log(scale / unit)))

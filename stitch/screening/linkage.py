@@ -73,19 +73,18 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
     """
     gram = overlaps.gram
     matched = {(m.v, m.w): len(m.residual) for m in overlaps.matches}
-    pairs = [(int(v), int(w)) for v, w in gram.pairs]
-    # Common targets have names: they always belong together.
-    held = [
-        pair
-        for pair, count, labelled in zip(pairs, gram.count, gram.labelled, strict=True)
-        if labelled or (not {*pair} & {*holding_nothing} and pair_holds(int(count), matched.get(pair, 0)))
-    ]
-    return linkage_of_pairs(gram.views, held)
+    linked = list[tuple[int, int]]()
+    for (v, w), within_gate, labelled in zip(gram.pairs.tolist(), gram.count.tolist(), gram.labelled, strict=True):
+        holds = pair_holds(within_gate, matched.get((v, w), 0)) and not {v, w} & {*holding_nothing}
+        # Common targets have names: they always belong together.
+        if labelled or holds:
+            linked.append((v, w))
+    return linkage_of_pairs(gram.views, linked)
 
 
-def pair_holds(count: int, matched: int) -> bool:
-    """Return True if so many correspondences within the robust gate, of all that matched, tell two poses."""
-    return count >= HOLDING and count >= LINKED_SHARE * matched > 0
+def pair_holds(within_gate: int, matched: int) -> bool:
+    """Return whether a pair's correspondences, of which so many lie within the robust gate, determine its motion."""
+    return within_gate >= HOLDING and within_gate >= LINKED_SHARE * matched > 0
 
 
 def linkage_of_pairs(views: int, pairs: Sequence[tuple[int, int]]) -> Linkage:
@@ -120,15 +119,15 @@ def find_contradicting_views(
         share: a view contradicts if significantly more of its points that others show stand elsewhere.
         groups: linked views: each is compared within its group, since groups may be displaced. (): with all.
     """
-    shown = _point_visibility(scans, poses, tolerance, _SEARCH_REACH * size)
+    visibility = _point_visibility(scans, poses, tolerance, _SEARCH_REACH * size)
     for group in groups:
         for v in group:
-            shown[v] = {w: by_w for w, by_w in shown[v].items() if w in group}
+            visibility[v] = {w: by_w for w, by_w in visibility[v].items() if w in group}
     contradicting = list[int]()
     while True:
         shares = [
             0.0 if v in contradicting else _contradicted_share(by_view, contradicting, share)
-            for v, by_view in enumerate(shown)
+            for v, by_view in enumerate(visibility)
         ]
         worst = int(np.argmax(shares))
         if not shares[worst]:
@@ -136,30 +135,30 @@ def find_contradicting_views(
         contradicting.append(worst)
 
 
-def _contradicted_share(shown: dict[int, PointVisibility], without: Sequence[int], least: float) -> float:
+def _contradicted_share(visibility: dict[int, PointVisibility], without: Sequence[int], least: float) -> float:
     """Return the share of a view's points, of those that other views show at all, that none shows in place.
 
     0 if the share is not significantly above `least`, by a binomial test.
 
     Args:
-        shown: by other view, what it shows of each point (`PointVisibility`).
+        visibility: by other view, what it shows of each point.
         without: views that do not count.
     """
-    others = [by_view for w, by_view in shown.items() if w not in without]
+    others = [by_view for w, by_view in visibility.items() if w not in without]
     if not others:
         return 0.0
     best = np.max(others, axis=0)
     elsewhere = int(np.sum(best == 1))
-    asked = int(np.sum(best > 0))
-    return elsewhere / asked if binomial_tail(elsewhere - 1, asked, least) < _CONTRADICTION_CHANCE else 0.0
+    seen = int(np.sum(best > 0))
+    return elsewhere / seen if binomial_tail(elsewhere - 1, seen, least) < _CONTRADICTION_CHANCE else 0.0
 
 
 def _point_visibility(
     scans: Sequence[Scan], poses: Array, tolerance: float, reach: float
 ) -> list[dict[int, PointVisibility]]:
-    """Return per view, by each other view near it, what that shows of the first one's n probed points (n,).
+    """Return per view v, by each view w near it, what w shows of the probed points (n,) of v (`PointVisibility`).
 
-    Values are those of `PointVisibility`. With many views near, points take turns among them; those not asked have 0.
+    Where many views are near, each is asked for every k-th point only, and shows 0 of the others.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner.
@@ -172,50 +171,51 @@ def _point_visibility(
         near[w].append(v)
 
     queries = neighbour_queries(scans, poses, [sample_points(scan, _CONTRADICTION_PROBES) for scan in scans])
-    parts: list[list[QueryPart]] = [[] for _ in scans]
+    # By view w, the points of other views that are sought in it: the view v, and a stride over its points.
+    asked: list[list[QueryPart]] = [[] for _ in scans]
     for v, others in enumerate(near):
-        turns = -(-len(others) // _VIEWS_COMPARED)
+        stride = -(-len(others) // _VIEWS_COMPARED)
         for k, w in enumerate(others):
-            parts[w].append((v, slice(k % turns, None, turns)))
+            asked[w].append((v, slice(k % stride, None, stride)))
 
-    def of_asked(w: int) -> dict[int, PointVisibility]:
-        """Return, by view whose points are sought in view w, what w shows of them (n,); one search for all."""
-        if not parts[w]:
-            return {}
-        _, points, normals = queries.gather(parts[w])
+    def answers_of(w: int) -> list[PointVisibility]:
+        """Return what view w shows of the points that are sought in it, part by part; they are searched at once."""
+        if not asked[w]:
+            return []
+        _, points, normals = queries.gather(asked[w])
         T = frames.inverse(poses[w])
-        _, along, beside = _nearest_partners(scans[w], frames.transform(T, points), frames.rotate(T, normals), reach)
-        at_same_place = beside < _SPACINGS * scans[w].spacing
-        away = np.abs(along) / tolerance
-        says = 2 * (at_same_place & (away < 1)) + (at_same_place & (away > _OFF_SURFACE_TOLERANCES))
-        bounds = np.cumsum(queries.counts(parts[w]))[:-1]
-        return dict(zip((v for v, _ in parts[w]), np.split(says, bounds), strict=True))
+        _, along, across = _nearest_partners(scans[w], frames.transform(T, points), frames.rotate(T, normals), reach)
+        at_same_place = across < _SPACINGS * scans[w].spacing
+        tolerances_off = np.abs(along) / tolerance
+        in_place = at_same_place & (tolerances_off < 1)
+        elsewhere = at_same_place & (tolerances_off > _OFF_SURFACE_TOLERANCES)
+        return np.split(2 * in_place + elsewhere, np.cumsum(queries.counts(asked[w]))[:-1])
 
-    shown = [{w: np.zeros(len(index), np.int8) for w in near[v]} for v, index in enumerate(queries.index)]
-    for w, answers in enumerate(parallel(of_asked, range(len(scans)))):
-        for v, asked in parts[w]:
-            shown[v][w][asked] = answers[v]
-    return shown
+    visibility = [{w: np.zeros(len(index), np.int8) for w in near[v]} for v, index in enumerate(queries.index)]
+    for w, answers in enumerate(parallel(answers_of, range(len(scans)))):
+        for (v, points_asked), answer in zip(asked[w], answers, strict=True):
+            visibility[v][w][points_asked] = answer
+    return visibility
 
 
 def points_in_place(scan: Scan, points: Array, normals: Array, tolerance: float) -> Mask:
-    """Return a mask (n,) of points that a scan shows at their place: near along the normal, and beside it.
+    """Return a mask (n,) of points that a scan shows at their place, along its normal and across.
 
-    Beside: within two local spacings, so that a sparse scan counts too.
+    Across means within two local spacings, so that a sparse scan counts too.
 
     Args:
         points, normals: (n, 3) in the scan's frame.
         tolerance: distance along the normal, length_unit.
     """
     reach = float(np.sqrt(scan.area.max())) * _SPACINGS + tolerance
-    index, along, beside = _nearest_partners(scan, points, normals, reach)
-    return (np.abs(along) < tolerance) & (beside < _SPACINGS * np.sqrt(scan.area[index]))
+    index, along, across = _nearest_partners(scan, points, normals, reach)
+    return (np.abs(along) < tolerance) & (across < _SPACINGS * np.sqrt(scan.area[index]))
 
 
 def _nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) -> tuple[Indices, Array, Array]:
-    """Return per point the number (n,) of a scan's nearest point, and the distance along and beside its normal (n,).
+    """Return per point the number (n,) of a scan's nearest point, and the distances (n,) along its normal and across.
 
-    Beside is infinite where there is none within `reach`, or where it is an edge or faces the other way.
+    The distance across is infinite where none is within `reach`, and where it is an edge or faces the other way.
 
     Args:
         points, normals: (n, 3) in the scan's frame.
@@ -227,5 +227,5 @@ def _nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) -
     normal = scan.normals.take(partner, axis=0)
     along = np.einsum("ni,ni->n", points - scan.points.take(partner, axis=0), normal)
     same_side &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, normal) > _SAME_SIDE)
-    beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=same_side, out=np.full(len(points), np.inf))
-    return partner, along, beside
+    across = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=same_side, out=np.full(len(points), np.inf))
+    return partner, along, across

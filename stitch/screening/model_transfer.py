@@ -82,7 +82,7 @@ def check_model_transfer(
     with suppress(NoResultError):
         fitted = fit().sessions
     every = zip(sessions, applied.sessions, fitted, strict=True)
-    return [_transfer_warnings(session, there, here) for session, there, here in every]
+    return [_transfer_warnings(*of_session) for of_session in every]
 
 
 def _transfer_warnings(session: SessionData, applied: FittedSession, fitted: FittedSession | None) -> tuple[str, ...]:
@@ -95,38 +95,38 @@ def _transfer_warnings(session: SessionData, applied: FittedSession, fitted: Fit
     Raises:
         NoResultError: no arm errs by as much as that model leaves.
     """
-    there = applied.targets
-    assert there is not None
-    beyond = beyond_any_arm(session, *np.sqrt(there.variances[:2]))
+    given = applied.targets
+    assert given is not None
+    beyond = beyond_any_arm(session, *np.sqrt(given.variances[:2]))
     text = None
     if fitted is not None and fitted.targets is not None:
-        text = _what_does_not_hold(there, fitted.targets, session.length_unit)
+        text = _what_does_not_hold(given, fitted.targets, session.length_unit)
     if text is not None:
         if beyond:
             raise NoResultError(f"{session.path}: {text}")
         return (f"{text[0].upper()}{text[1:]}.",)
     if beyond and fitted is None:
-        off = length_text(there.rms, session.length_unit)
+        off = length_text(given.rms, session.length_unit)
         raise NoResultError(f"{session.path}: {sentence('model of another set-up', off=off)}")
     return ()
 
 
-def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) -> str | None:
+def _what_does_not_hold(given: TargetModelFit, refitted: TargetModelFit, unit: str) -> str | None:
     """Return a sentence that hand-eye or targets have moved since the other run, and what to do; None if neither has.
 
     Moved means two things: fitted here, they leave significantly smaller residuals; and they differ from the other
     run's by more than the covariances of both allow.
 
     Args:
-        there: the views of this session under the model of the other run.
-        here: the same views with hand-eye and targets fitted to them.
+        given: the views of this session under the model of the other run.
+        refitted: the same views with hand-eye and targets fitted to them.
         unit: of length.
     """
-    if not significantly_smaller(here.view_squares, there.view_squares, _MODEL_CHANCE):
+    if not significantly_smaller(refitted.view_squares, given.view_squares, _MODEL_CHANCE):
         return None
-    # Right perturbation (6,) from the hand-eye there to the one here, scanner frame, as their covariances count it.
-    xi = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)
-    square = mahalanobis_square(xi, there.model.covariance + here.model.covariance)
+    # Right perturbation (6,) from the given hand-eye to the refitted one, scanner frame, as their covariances count it.
+    xi = frames.log(frames.inverse(given.model.T_mount) @ refitted.model.T_mount)
+    square = mahalanobis_square(xi, given.model.covariance + refitted.model.covariance)
     moved = []
     if chi2_tail(square, 6) < _MODEL_CHANCE / 2:
         mrad = 1e3 * float(np.linalg.norm(xi[:3]))
@@ -135,7 +135,7 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
             f"the hand-eye of the other run does not hold here: fitted here it lies {shift} and {mrad:.3g} mrad from "
             "there"
         )
-    displaced = _displaced_targets(there, here)
+    displaced = _displaced_targets(given, refitted)
     if displaced:
         more = f" and {len(displaced) - _LISTED} more" if len(displaced) > _LISTED else ""
         lie = "lie" if len(displaced) > 1 else "lies"
@@ -144,27 +144,27 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
         moved.append(f"{names}{more} {lie} elsewhere than in the other run, by up to {farthest}")
     if not moved:
         return None
-    rms_there = length_text(_rms(there.view_squares), unit)
-    rms_here = length_text(_rms(here.view_squares), unit)
-    return sentence("model does not hold", what="; ".join(moved), off=rms_there, fitted=rms_here)
+    rms_given = length_text(_rms(given.view_squares), unit)
+    rms_refitted = length_text(_rms(refitted.view_squares), unit)
+    return sentence("model does not hold", what="; ".join(moved), off=rms_given, fitted=rms_refitted)
 
 
-def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str, float]:
+def _displaced_targets(given: TargetModelFit, refitted: TargetModelFit) -> dict[str, float]:
     """Return by name how far (length_unit) targets are from where the other run has them, of those that have moved.
 
     A target has moved if a χ² test of three coordinates rejects, by the sigmas of both runs, at half of `_MODEL_CHANCE`
     over the number of targets (Bonferroni).
 
     Args:
-        there: the session under the model of the other run.
-        here: with hand-eye and targets fitted to it.
+        given: the session under the model of the other run.
+        refitted: with hand-eye and targets fitted to it.
     """
-    sigmas = here.landmark_sigmas
-    known = {name: k for k, name in enumerate(here.rows.sightings.targets) if name in there.model.targets}
+    sigmas = refitted.landmark_sigmas
+    known = {name: k for k, name in enumerate(refitted.rows.sightings.targets) if name in given.model.targets}
     displaced = dict[str, float]()
     for name, k in known.items():
-        other = there.model.targets[name]
-        difference = here.landmarks.positions[k] - other.position
+        other = given.model.targets[name]
+        difference = refitted.landmarks.positions[k] - other.position
         variance = sigmas[k] ** 2 + other.sigma**2
         if chi2_tail(float(np.sum(difference**2 / np.maximum(variance, 1e-300))), 3) < _MODEL_CHANCE / 2 / len(known):
             displaced[name] = float(np.linalg.norm(difference))

@@ -15,6 +15,7 @@ from stitch.numerics.frames import Array, Indices
 from stitch.observations.targets.outliers import LIMIT_TARGET
 from stitch.observations.targets.rows import COMPARED_TARGETS, distance_sigma, target_distances, target_positions
 from stitch.session.capture import Sightings
+from stitch.session.scan import even_indices
 
 # Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
 _SIDE, _TARGETS = 2, 3
@@ -67,9 +68,8 @@ def _most_stepped_targets(places: Array, sigma: float) -> list[tuple[int, int]]:
         sigma: of a distance, length_unit, as the sensor states it: the least that is taken for the scatter.
     """
     count = places.shape[1]
-    some = np.linspace(0, count - 1, min(count, COMPARED_TARGETS)).astype(int)
     typical = []
-    for k in some:
+    for k in even_indices(count, COMPARED_TARGETS).tolist():
         off = _distances_from_median(places, k)
         seen = np.isfinite(off)
         typical.append(float(np.median(np.abs(off[seen]))) if seen.any() else 0.0)
@@ -98,7 +98,7 @@ def _partners(places: Array, k: int) -> Indices:
     together = seen[:, k].astype(float) @ seen
     together[k] = 0
     others = np.flatnonzero(together > together.max() / 2)
-    return others[np.linspace(0, len(others) - 1, min(len(others), COMPARED_TARGETS - 1)).astype(int)]
+    return others[even_indices(len(others), COMPARED_TARGETS - 1)]
 
 
 def _steps_of_means(off: Array) -> Array:

@@ -35,17 +35,14 @@ _EVERY = 50
 _MOVED = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}
 
 
-def explain_misplaced(
-    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
-) -> list[SessionProblem]:
+def explain_misplaced(session: SessionData, snooping: Snooping) -> list[SessionProblem]:
     """Return the problems that explain every view and step which snooping found, with the rows and what to do.
 
     What one mistake of several rows explains is not blamed on single views: copies first, then scans that fit each
     other's rows, then views by themselves; steps and groups without a common surface are named as such.
 
     Args:
-        session, capture: with the same views.
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
+        session: with the views that were tested.
     """
     names = session.names
     unexplained = {m.view: m for m in snooping.misplaced}
@@ -57,11 +54,11 @@ def explain_misplaced(
         for v in views:
             unexplained.pop(v, None)
 
-    for v, w in find_copies(capture):
+    for v, w in find_copies(snooping.capture):
         bad, good = (v, w) if v in snooping.left_out and w not in snooping.left_out else (w, v)
         unexplained.pop(bad, None)
         out.append(problem("copied scan", (names[v], names[w]), of=names[good]))
-    rows = find_fitting_rows(capture, snooping, [*unexplained.values()])
+    rows = find_fitting_rows(snooping, [*unexplained.values()])
     for cycle in exchange_cycles(rows):
         if len(cycle) == 2:
             explain("pair", cycle, pair=f"{names[cycle[0]]} and {names[cycle[1]]}")
@@ -71,8 +68,8 @@ def explain_misplaced(
     rest = {v: row for v, row in rows.items() if v in unexplained}
     for v, row in exchanged_pairs(rest, [*unexplained.values()]):
         explain("pair with a silent scan", sorted((v, row)), view=names[v], silent=names[row])
-    same = find_same_poses(capture)
-    out += [_single_view_problem(session, capture, T_mount, snooping, m, same) for m in unexplained.values()]
+    same = find_same_poses(snooping.capture)
+    out += [_single_view_problem(session, snooping, m, same) for m in unexplained.values()]
     for step in snooping.steps:
         side = range(step.start) if step.start <= snooping.largest_segment.start else range(step.start, len(names))
         what = _MOVED[step.moved] if step.distinguishable else "the part or the scanner moved"
@@ -81,28 +78,23 @@ def explain_misplaced(
         for v in snooping.alone:
             explain("alone", [v])
     elif len(snooping.disconnected) > 1:
-        shown = " | ".join(list_views([names[v] for v in group], names) for group in snooping.disconnected)
-        explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=shown)
+        groups = " | ".join(list_views([names[v] for v in group], names) for group in snooping.disconnected)
+        explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=groups)
     return out
 
 
 def _single_view_problem(
-    session: SessionData,
-    capture: Capture,
-    T_mount: Array,
-    snooping: Snooping,
-    m: MisplacedView,
-    same: Sequence[tuple[int, int]],
+    session: SessionData, snooping: Snooping, m: MisplacedView, same: Sequence[tuple[int, int]]
 ) -> SessionProblem:
     """Return what is wrong with one view: its cloud, a pose copied from another row, one joint, or else its pose.
 
     Args:
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
         m: how the view stands off; `T` is None where its surface fits nowhere.
         same: pairs of views that have the very same pose.
     """
     names = session.names
     name = names[m.view]
+    capture = snooping.capture
     scan = capture.scans[m.view]
     others = [v for v in snooping.linkage.core if v != m.view]
     if others and m.kind != "several" and not shows_no_surface(scan):
@@ -127,7 +119,7 @@ def _single_view_problem(
         by_joints = session.views[m.view].joints is not None and abs(partner - m.view) == 1
         mistake = "copied joints" if by_joints else "copied pose"
         return problem(mistake, (name, names[partner]), view=name, of=names[partner], off=off)
-    joint = find_wrong_joint(session, capture, T_mount, m)
+    joint = find_wrong_joint(session, snooping, m)
     if joint is None:
         return problem("displaced", [name], off=off)
     column, stated, fits, is_neighbours = joint
@@ -136,7 +128,7 @@ def _single_view_problem(
 
 
 def find_wrong_joint(
-    session: SessionData, capture: Capture, T_mount: Array, m: MisplacedView
+    session: SessionData, snooping: Snooping, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
     """Return the joint that alone explains a view's displacement; None where no joint does, or joints are not known.
 
@@ -147,14 +139,14 @@ def find_wrong_joint(
     joints = session.views[m.view].joints
     if robot is None or joints is None or m.T is None or session.axes:
         return None
-    points = capture.scans[m.view].points[::_EVERY]
+    points = snooping.capture.scans[m.view].points[::_EVERY]
     on_surface = frames.transform(m.T, points)
 
     def distance_at(q: Array) -> float:
         """Return the rms distance (length_unit) of the scan's points at joints q (n,), rad, from where they fit."""
         T = forward(robot, q)
         T = frames.inverse(T) if session.mount == "eye_to_hand" else T
-        return float(np.sqrt(((frames.transform(T @ T_mount, points) - on_surface) ** 2).sum(axis=1).mean()))
+        return float(np.sqrt(((frames.transform(T @ snooping.T_mount, points) - on_surface) ** 2).sum(axis=1).mean()))
 
     best: tuple[float, int, float] = (np.inf, 0, 0.0)
     for j in range(len(joints)):
@@ -172,14 +164,13 @@ def find_wrong_joint(
     return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(joints[j] + turn)), is_neighbours
 
 
-def find_fitting_rows(
-    capture: Capture, snooping: Snooping, misplaced: Sequence[MisplacedView]
-) -> dict[int, int | None]:
+def find_fitting_rows(snooping: Snooping, misplaced: Sequence[MisplacedView]) -> dict[int, int | None]:
     """Return, by misplaced view whose scan fits the part, the row to whose pose the scan belongs; None: no other row.
 
     First the row whose pose is near where the scan was placed. Where there is none, and several views are misplaced,
     scans may slide along the part: then the row at whose pose the scan fits.
     """
+    capture = snooping.capture
     rows = {m.view: _nearest_row(capture, snooping.expected, m.view, m.T) for m in misplaced if m.T is not None}
     elsewhere = [view for view, row in rows.items() if row is None]
     core = [v for v in snooping.linkage.core if v not in snooping.not_belonging]
@@ -187,7 +178,7 @@ def find_fitting_rows(
         return rows
     surface = surface_of(capture.scans, snooping.unconstrained.poses, core, snooping.tolerance)
     every = [m.view for m in misplaced]
-    return rows | {v: _row_where_it_fits(capture, snooping, surface, v, every) for v in elsewhere}
+    return rows | {v: _row_where_it_fits(snooping, surface, v, every) for v in elsewhere}
 
 
 def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | None:
@@ -203,35 +194,35 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
     return best if close and best != view else None
 
 
-def _row_where_it_fits(
-    capture: Capture, snooping: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
-) -> int | None:
-    """Return the row of the table of poses at whose pose a scan fits the surface after the smallest motion.
+def _row_where_it_fits(snooping: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]) -> int | None:
+    """Return the row of views.csv at whose pose a scan fits the surface, the one that needs the smallest motion.
 
-    None if it fits at its own row, whatever the others need, or at none.
+    None if the scan fits at its own row, even where another row needs less motion, and None if it fits at no row.
 
     Args:
         surface: of the views that belong together.
         view: number of the scan, and of its own row.
         rows: numbers of the rows that are tried.
     """
+    capture = snooping.capture
     near = CLOSE_SHARE * part_size([capture])
-    moved = dict[int, float]()
+    motion_needed = dict[int, float]()
     for row in rows:
         T = snooping.expected[row]
         best = place_scan(capture.scans[view], surface, T[None], near)[0]
-        away = float(_pose_distances(capture, view, best.T, T[None])[0])
-        if best.closure > snooping.needed and best.near > FEW_SHARED and away < near:
-            moved[row] = away
-    best_row = min(moved, key=lambda row: moved[row], default=view)
-    return best_row if view not in moved and best_row != view else None
+        moved = float(_pose_distances(capture, view, best.T, T[None])[0])
+        if best.closure > snooping.needed and best.near > FEW_SHARED and moved < near:
+            motion_needed[row] = moved
+    if view in motion_needed:
+        return None
+    return min(motion_needed, key=lambda row: motion_needed[row], default=None)
 
 
 def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Array:
-    """(P,) rms distance between the points of a scan at one pose (4, 4) and at others (P, 4, 4)."""
+    """Return (P,) the rms distance between the points of a scan at one pose (4, 4) and at others (P, 4, 4)."""
     points = capture.scans[view].points[::_EVERY]
-    there = frames.transform(T, points)
-    return np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1))
+    placed = frames.transform(T, points)
+    return np.sqrt(((frames.transform(poses, points) - placed) ** 2).sum(axis=2).mean(axis=1))
 
 
 def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:

@@ -202,8 +202,7 @@ def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array
         H += 1e-4 * (np.trace(H, axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(6)
         step = -np.linalg.solve(H, b[..., None])[..., 0]
         step[:, :3] /= lever
-        to = frames.make(np.eye(3), -frames.transform(poses, centre[None])[:, 0])
-        poses = frames.inverse(to) @ frames.exp(step) @ to @ poses
+        poses = frames.moved_about(frames.transform(poses, centre[None])[:, 0], step, poses)
     return poses
 
 
@@ -247,25 +246,27 @@ def place_unlinked_views(
     model_poses: Array,
     unconstrained: UnconstrainedPoses,
     linked: Linkage,
-    limits: tuple[float, float],
+    tolerance: float,
+    needed: float,
 ) -> tuple[dict[int, Placement], list[int], set[int]]:
     """Return the unlinked views that can be placed, those that cannot, and of these the ones that fit several places.
 
-    The core is the largest group of linked views. Other groups are placed first, each as a whole, then single views;
-    each one placed joins the core, and the others are tried again. On a part that looks alike from several sides a view
-    may fit several places: it is not placed unless one of them is the pose of its own row in the table.
+    They are placed on the surface of the core, the largest group of linked views. Other groups are placed first, each
+    as a whole, then single views, round by round: those placed join the core, and the others are tried again. On a part
+    that looks alike from several sides a view may fit several places: it is not placed unless one of them is the pose
+    of its own row in the table.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
         unconstrained: the views moved by the overlaps alone.
-        limits: largest distance from the surface that lies on it, length_unit, and the closure needed.
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
+        needed: closure from which a scan counts as placed.
     """
     if not linked.unlinked or len(linked.core) < 2:
         return {}, list(linked.unlinked), set()
-    tolerance, needed = limits
     size = part_size([capture])
     poses = np.array(unconstrained.poses)
-    placed = place_groups(capture, poses, linked, limits)
+    placed = place_groups(capture, poses, linked, tolerance, needed)
     for v, placement in placed.items():
         poses[v] = placement.T
     alone = [v for v in linked.unlinked if v not in placed]
@@ -274,14 +275,13 @@ def place_unlinked_views(
     several = set[int]()
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
-        new = {}
-        for v in (v for v in waiting if not shows_no_surface(capture.scans[v])):
-            best, has_others = _place_alone(capture, model_poses, v, surface, (needed, size))
-            several.discard(v)
-            if best is not None and has_others:
-                several.add(v)
-            elif best is not None:
-                new[v] = best
+        fits = {
+            v: _place_alone(capture, model_poses, v, surface, needed)
+            for v in waiting
+            if not shows_no_surface(capture.scans[v])
+        }
+        several = {v for v, (best, has_rivals) in fits.items() if best is not None and has_rivals}
+        new = {v: best for v, (best, has_rivals) in fits.items() if best is not None and not has_rivals}
         if not new:
             break
         for v, placement in new.items():
@@ -301,7 +301,7 @@ def place_unlinked_views(
 
 
 def _place_alone(
-    capture: Capture, model_poses: Array, view: int, surface: ReferenceSurface, limits: tuple[float, float]
+    capture: Capture, model_poses: Array, view: int, surface: ReferenceSurface, needed: float
 ) -> tuple[Placement | None, bool]:
     """Return where a single scan fits the surface, None if nowhere, and whether it fits another place about as well.
 
@@ -309,9 +309,9 @@ def _place_alone(
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner of the rows.
-        limits: the closure needed, and the size of the part, length_unit.
+        needed: closure from which a scan counts as placed.
     """
-    _, size = limits
+    size = part_size([capture])
     scan = capture.scans[view]
     # The scan's centre on the surface's centre, turned every way.
     R = Rotation.random(_TURNS_ANYWHERE, rng=np.random.default_rng(0)).as_matrix()
@@ -321,7 +321,7 @@ def _place_alone(
     # A part clamped anew lies near: a wide gate would lead past it.
     placements += place_scan(scan, surface, model_poses[view][None], _NEAR_GATE * size)
     shared = max(FEW_SHARED, HOLDING / scan.usable.sum())
-    closed = closed_placements(scan, [p for p in placements if p.near > shared], model_poses, limits)
+    closed = closed_placements(scan, [p for p in placements if p.near > shared], model_poses, needed, size)
     row = model_poses[view : view + 1]
     at_row = next((p for p in closed if _distance_from_rows(scan, p, row) < CLOSE_SHARE * size), None)
     if at_row is not None or not closed:
@@ -330,7 +330,7 @@ def _place_alone(
 
 
 def closed_placements(
-    scan: Scan, placements: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
+    scan: Scan, placements: Sequence[Placement], model_poses: Array, needed: float, size: float
 ) -> list[Placement]:
     """Return the placements with enough closure, the nearest to any row's pose first.
 
@@ -338,9 +338,9 @@ def closed_placements(
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner of the rows.
-        limits: the closure needed, and the size of the part, length_unit.
+        needed: closure from which a scan counts as placed.
+        size: of the part, length_unit.
     """
-    needed, size = limits
     away = [_distance_from_rows(scan, p, model_poses) for p in placements]
     limit = [needed * (_CLOSURE_AT_ROW if distance < CLOSE_SHARE * size else 1.0) for distance in away]
     closed = [i for i, p in enumerate(placements) if p.closure > limit[i]]
@@ -354,13 +354,15 @@ def has_rival(scan: Scan, best: Placement, closed: Sequence[Placement], size: fl
 
 
 def _distance_from_rows(scan: Scan, placement: Placement, model_poses: Array) -> float:
-    """Return how far a placement is from the nearest row's pose, rms of the points."""
+    """Return the rms distance (length_unit) of a placed scan's points from where the nearest row's pose puts them."""
     points = scan.points[::50]
-    off = frames.transform(model_poses, points) - frames.transform(placement.T, points)
-    return float(np.sqrt((off**2).sum(axis=2).mean(axis=1)).min())
+    displacement = frames.transform(model_poses, points) - frames.transform(placement.T, points)
+    return float(np.sqrt((displacement**2).sum(axis=2).mean(axis=1)).min())
 
 
-def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
+def place_groups(
+    capture: Capture, poses: Array, linked: Linkage, tolerance: float, needed: float
+) -> dict[int, Placement]:
     """Return the placements of the views in groups outside the core, each group moved as one body.
 
     The views of a group share their displacement: together they show more of the others' surface than each alone. A
@@ -368,9 +370,9 @@ def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views of each group fit together.
-        limits: distance from the surface that still lies on it, length_unit, and the closure needed.
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
+        needed: closure from which a group counts as placed.
     """
-    tolerance, needed = limits
     size = part_size([capture])
     core = list(linked.core)
     placed = dict[int, Placement]()

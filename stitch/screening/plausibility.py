@@ -16,7 +16,7 @@ from stitch.screening.background import find_occluder, find_static_background
 from stitch.screening.hypotheses import BOTH_ORDERS, euler_angles, problem, sentence
 from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.snooping import MisplacedView, Snooping
-from stitch.session.capture import Capture, part_size
+from stitch.session.capture import part_size
 from stitch.session.session import SessionData
 
 # No arm scatters by more.
@@ -92,20 +92,19 @@ def suspicion_in_words(session: SessionData, view: MisplacedView) -> str:
     return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
 
 
-def snooping_warnings(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> tuple[str, ...]:
+def snooping_warnings(session: SessionData, snooping: Snooping) -> tuple[str, ...]:
     """Return warnings about the session as a whole: one about pose errors at the most, then background, then steps.
 
     Args:
         snooping: the outlier tests of every view's pose (data snooping).
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
     """
-    pose_errors = _pose_error_warning(session, capture, snooping, T_mount)
-    background = (found.fix for found in background_problems(session, capture, T_mount, snooping))
+    pose_errors = _pose_error_warning(session, snooping)
+    background = (found.fix for found in background_problems(session, snooping))
     steps = (step.describe(session.names, session.length_unit) for step in snooping.steps)
     return (*([pose_errors] if pose_errors else []), *background, *steps)
 
 
-def _pose_error_warning(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str | None:
+def _pose_error_warning(session: SessionData, snooping: Snooping) -> str | None:
     """Return the first of three warnings about pose errors that applies, or None.
 
     1. Rounding of the table explains the scatter: then neither the arm nor any view is to blame.
@@ -116,35 +115,32 @@ def _pose_error_warning(session: SessionData, capture: Capture, snooping: Snoopi
     if rounding is not None:
         return f"{rounding.describe()}."
     if scatters_beyond_effects(session, snooping):
-        return _implausible_scatter(session, capture, snooping, T_mount)
+        return _implausible_scatter(session, snooping)
     return check_few_views(session, snooping)
 
 
-def background_problems(
-    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
-) -> list[SessionProblem]:
+def background_problems(session: SessionData, snooping: Snooping) -> list[SessionProblem]:
     """Return what the scans show beside the part, as problems: background that stands still, or things in the way.
 
     Things in the way are only sought if there is no background, and no view is left out or displaced.
-
-    Args:
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
     """
-    size = part_size([capture])
+    scans = snooping.capture.scans
+    size = part_size([snooping.capture])
     names = session.names
-    background = find_static_background(capture.scans, capture.poses(T_mount), snooping.tolerance, size)
+    model_poses = snooping.capture.poses(snooping.T_mount)
+    background = find_static_background(scans, model_poses, snooping.tolerance, size)
     if background is not None:
-        share, views, box, within = background
-        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *box, strict=True))
+        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *background.box, strict=True))
         how = f"cut {', '.join(sides)} {session.length_unit} out of the scans"
-        if within is not None:
-            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in within)
+        if background.within is not None:
+            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in background.within)
             how = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
-        return [problem("background", [names[v] for v in views], share=share, count=len(views), how=how)]
+        showing = [names[v] for v in background.views]
+        return [problem("background", showing, share=background.share, count=len(showing), how=how)]
     if snooping.left_out or snooping.steps:
         # The part itself stands elsewhere where a view is off; without that view it is asked again.
         return []
-    occluder = find_occluder(capture.scans, snooping.unconstrained.poses, size)
+    occluder = find_occluder(scans, snooping.unconstrained.poses, size)
     if occluder is None:
         return []
     views, share = occluder
@@ -153,15 +149,11 @@ def background_problems(
     return [problem("in the way", named, share=share, where=list_views(named, names), show=show)]
 
 
-def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str:
-    """Return a warning of poses that scatter more than those of any arm, with the views farthest from their pose.
-
-    Args:
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
-    """
-    model_poses = capture.poses(T_mount)
+def _implausible_scatter(session: SessionData, snooping: Snooping) -> str:
+    """Return a warning of poses that scatter more than those of any arm, with the views farthest from their pose."""
+    model_poses = snooping.capture.poses(snooping.T_mount)
     twists = frames.log(snooping.unconstrained.poses @ frames.inverse(model_poses))
-    middles = np.array([points.mean(axis=0) for points in capture.visible_points])
+    middles = np.array([points.mean(axis=0) for points in snooping.capture.visible_points])
     in_reference = frames.transform(model_poses, middles[:, None])[:, 0]
     displacement = np.linalg.norm(twists[:, 3:] + np.cross(twists[:, :3], in_reference), axis=1)
     worst = [v for v in np.argsort(-displacement) if v not in snooping.left_out][:_LISTED]

@@ -11,7 +11,7 @@ comes from the same data, times the number of tests (Bonferroni). What drifts, w
 is no step, so the scatter holds all by which poses of a good session may err, in sizes that they show.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -31,7 +31,7 @@ from stitch.screening.view_model import (
     ViewModel,
     displacement_lower_bound,
     hstack_columns,
-    leave_one_out_test,
+    leave_one_out_p_value,
     left_out_test,
     projector,
     rotation_shift_lower_bounds,
@@ -110,10 +110,10 @@ class BlunderSearch:
     mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
     null_projector: Projector  # null hypothesis with those columns in it
     unplaced: Sequence[int] = ()  # views that nothing holds
-    # Views that overlapped no other, were placed by their surfaces, and are off by more than the others scatter.
+    # Views that overlap no other at the robot's poses, and whose surface fits farther from there than poses scatter.
     unlinked_blunders: Sequence[int] = ()
     steps: tuple[PoseStep, ...] = ()
-    # Of these, those that effects of the arm do not explain either, in sizes that the other views show.
+    # Of the unlinked blunders, those that effects of the arm do not explain either, in sizes that the other views show.
     beyond_effects: frozenset[int] = frozenset()
 
     @property
@@ -137,15 +137,16 @@ def pose_tests(
 ) -> BlunderSearch:
     """Return the single views that are off their pose, and the steps: displacements common to all views from one on.
 
-    Views that were placed by their surfaces are tested first, then all others with these free. Steps are tested with
-    the single views that are off free. If there is a step, single views are tested again with it free, since a view at
-    the step may have stood in for it.
+    Placed views are tested first, one by one; then all others, with the placed ones that are off free; then steps, with
+    all single views that are off free. A single view may have stood in for a step that begins there: so where there is
+    a step, single views are tested again with it free. Last, placed views that are off are held against what an arm may
+    do (`BlunderSearch.beyond_effects`).
 
     Args:
         model: the evidence about the views' poses.
         unconstrained: the views where their surfaces put them.
-        unplaced: views that no surface holds: they are free in all tests.
-        placed: views that overlapped no other, and were placed by their surfaces.
+        unplaced: views that overlap no other, and whose surface fits nowhere: they are free in all tests.
+        placed: views that overlap no other at the robot's poses, and were found by their surface elsewhere on the part.
         usual: effects that steps are tested against, beside white scatter; None, or with `MAX_VIEWS_WITH_EFFECTS` views
             or more, which would take minutes: white scatter alone.
         chance: level of the test of steps.
@@ -155,15 +156,20 @@ def pose_tests(
     model_with_effects = model
     if usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS:
         model_with_effects = model.with_errors(usual.errors(unconstrained))
-    singles = search.mean_columns, len(unlinked_blunders) + len(search.blunders)
+    singles = search.mean_columns if unlinked_blunders or search.blunders else None
     steps = find_steps(model_with_effects, model.columns(unplaced), singles, chance)
     if steps:
         unlinked_blunders = _find_unlinked_blunders(model, unplaced, placed, steps)
         search = find_blunders(model, [*unplaced, *unlinked_blunders], steps)
     # Without effects white scatter is all that may happen, and every blunder is beyond it.
-    beyond_effects = frozenset(_find_unlinked_blunders(model_with_effects, unplaced, unlinked_blunders, steps))
-    search = replace(search, unplaced=unplaced, unlinked_blunders=unlinked_blunders)
-    return replace(search, steps=steps, beyond_effects=beyond_effects)
+    beyond_effects = _find_unlinked_blunders(model_with_effects, unplaced, unlinked_blunders, steps)
+    return replace(
+        search,
+        unplaced=unplaced,
+        unlinked_blunders=unlinked_blunders,
+        steps=steps,
+        beyond_effects=frozenset(beyond_effects),
+    )
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
@@ -192,7 +198,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         tests = dict(zip(rest, test_alternatives(under, [model.views[v] for v in rest]), strict=True))
         likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
         # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
-        chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
+        chance = {v: min(tests[v].p_value, leave_one_out_p_value(model, columns, v)) for v in likely}
         worst = min(likely, key=lambda v: chance[v])
         freed.append(worst)
         if chance[worst] * len(rest) < FAMILY_WISE:
@@ -204,18 +210,19 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
 def _find_unlinked_blunders(
     model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
 ) -> list[int]:
-    """Return the unlinked views whose displacement the scatter of all others does not explain, at level `FAMILY_WISE`.
+    """Return those of some unlinked views whose displacement the scatter of all other views does not explain.
 
-    Each is tested with the excluded ones and the other unlinked ones free.
+    The level is `FAMILY_WISE`. Each is tested with the excluded views and the other unlinked ones free.
 
     Args:
         excluded: views that are free in all tests.
-        unlinked: views to test, placed by their surfaces.
+        unlinked: views to test: they overlap no other at the robot's poses, and are where their surface fits.
+        steps: displacements of all views from one on: they are free too.
     """
     blunders = []
     for v in unlinked:
         others = [*excluded, *(w for w in unlinked if w != v)]
-        p = model.count * leave_one_out_test(model, _free_view_columns(model, others, steps), v)[1]
+        p = model.count * leave_one_out_p_value(model, _free_view_columns(model, others, steps), v)
         if p < FAMILY_WISE:
             blunders.append(v)
     return blunders
@@ -228,24 +235,21 @@ def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequenc
     return hstack_columns(model.columns(excluded), *(step.columns(model) for step in steps))
 
 
-def find_steps(
-    model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
-) -> tuple[PoseStep, ...]:
+def find_steps(model: ViewModel, known: Array | None, singles: Array | None, chance: float) -> tuple[PoseStep, ...]:
     """Return the steps in the order of their views: displacements that all views from one on share.
 
-    They are searched with only the known views free, and again with all single blunders free. The second result is
-    taken where the first has none, or where it has the smaller Akaike criterion.
+    They are searched with only the views free that are known to be off, and again with all single blunders free. The
+    second result is taken where the first has none, or where it has the smaller Akaike criterion.
 
     Args:
         model: its covariance has all that may happen without a step.
-        first: (n, K) columns of views known to be off.
-        singles: columns (n, K) of these and of all single blunders, and the number of single blunders.
+        known: (n, K) columns of views known to be off; None: none.
+        singles: (n, K) columns of these and of all single blunders; None: there are no blunders.
         chance: level of the test of a step.
     """
-    single_columns, single_count = singles
-    steps, columns = _search_steps(model, first, chance)
-    if single_count:
-        steps_beside_singles, all_columns = _search_steps(model, single_columns, chance)
+    steps, columns = _search_steps(model, known, chance)
+    if singles is not None:
+        steps_beside_singles, all_columns = _search_steps(model, singles, chance)
         if not steps or _akaike_criterion(model, all_columns) < _akaike_criterion(model, columns):
             steps = steps_beside_singles
     return tuple(sorted(steps, key=lambda step: step.start))
@@ -280,8 +284,11 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
     picked = list[_Pick]()
     significant = 0
     while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
-        taken = [pick.starts for pick in picked if pick.starts is not None]
-        pick = _next_pick(model, with_columns_of(picked), taken) if len(taken) < _MAX_STEPS else None
+        steps_picked = [pick.starts for pick in picked if pick.starts is not None]
+        if len(steps_picked) == _MAX_STEPS:
+            break
+        taken = {start for starts in steps_picked for start in starts.values()}
+        pick = _next_pick(model, with_columns_of(picked), taken)
         if pick is None:
             break
         p = pick.p_value
@@ -304,12 +311,12 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
     return [step for step in steps if step.p_value < chance], with_columns_of(picked)
 
 
-def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
+def _next_pick(model: ViewModel, columns: Array | None, taken: Collection[int]) -> _Pick | None:
     """Return the step, or single view, that explains most with some columns free; None where these leave no view.
 
     Args:
         columns: (n, K) in the mean already.
-        taken: by body, the views at which earlier steps begin: these are not tried again.
+        taken: views at which earlier steps begin, of the part or of the scanner: these are not tried again.
     """
     under = projector(model, model.fit(columns), columns)
     mean = model.mixed(columns).A[0]
@@ -324,8 +331,7 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
     if not view_tests:
         return None
     possible_starts = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
-    taken_starts = {k for starts in taken for k in starts.values()}
-    starts = [k for k in possible_starts if k not in taken_starts]
+    starts = [k for k in possible_starts if k not in taken]
     steps = {(moved, k): model.steps[moved][k] for moved in MOVED_BODIES for k in starts}
     new_steps = {step: displaced for step, displaced in steps.items() if is_new(displaced)}
     step_tests = dict(zip(new_steps, test_alternatives(under, list(new_steps.values())), strict=True))
@@ -416,19 +422,18 @@ def expected_poses(
     return frames.moved_about(model.centre, twists, model_poses)
 
 
-def least_displacement(
-    model: ViewModel, search: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
-) -> DisplacementSize:
+def least_displacement(model: ViewModel, search: BlunderSearch, view: int, middle: Array) -> DisplacementSize:
     """Return the smallest rotation (rad) and shift (length_unit) of a view that its evidence admits, at 99 %.
 
+    All other views that stand off, and the steps, are free.
+
     Args:
-        search: has the scatter of the poses.
-        others: further views that are off: they are free.
-        steps: displacements of all views from one on: they are free too.
+        search: the tests of all views; it has the scatter of the poses.
         view: number of the view.
         middle: (3,) centroid of its points, whose shift counts, reference frame.
     """
-    under = projector(model, search.fit, _free_view_columns(model, others, steps))
+    others = [v for v in search.standing_off if v != view]
+    under = projector(model, search.fit, _free_view_columns(model, others, search.steps))
     carried = np.eye(6)
     carried[3:, :3] = -frames.skew(middle - model.centre) / model.lever
     tested = test_alternative(under, model.held_responses[view])

@@ -12,7 +12,7 @@ from stitch.observations.surfaces.matching import sample_points
 from stitch.screening.hypotheses import UNITS
 from stitch.screening.placement import ReferenceSurface, evaluate_placement, place_scan, starts_about
 from stitch.session.capture import Capture
-from stitch.session.scan import Scan, prepare_scan
+from stitch.session.scan import Scan, even_indices, prepare_scan
 
 # Reflections of the scanner frame, with what was done.
 _FLIPS = {
@@ -31,6 +31,9 @@ _STAYS = 0.03
 _RANGE_LEFT = 0.3
 # Points that hold a factor on a scan, and gates, as shares of the part's size, at which these are matched.
 _PROBES, _GATES = 600, np.geomspace(0.1, 0.01, 25)
+
+# Points by which two scans are compared.
+_COMPARED = 60
 
 # A mistake of the list in `hypotheses`, and its words.
 ScanFault = tuple[str, dict[str, Any]]
@@ -126,8 +129,7 @@ def _fit_scale(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> 
         H = J.T @ (weight[:, None] * J)
         step = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1e-9) * np.eye(7), J.T @ (weight * residual))
         step[[0, 1, 2, 6]] /= lever
-        to = frames.make(np.eye(3), -frames.transform(T, centre[None])[0])
-        T = frames.inverse(to) @ frames.exp(step[:6]) @ to @ T
+        T = frames.moved_about(frames.transform(T, centre[None])[0], step[:6], T)
         scale *= 1 + float(step[6])
     return scale
 
@@ -141,8 +143,8 @@ def _same_points(a: Scan, b: Scan) -> bool:
     """Return whether nearly every point of `a` is found in `b`, within 1e-4 of the spacing: never so by chance."""
     if abs(len(a.points) - len(b.points)) > 0.02 * max(len(a.points), len(b.points)):
         return False
-    index = np.linspace(0, len(a.points) - 1, min(len(a.points), 60)).astype(int)
-    distance, _ = b.tree.query(np.ascontiguousarray(a.points[index]), k=1)
+    points = a.points[even_indices(len(a.points), _COMPARED)]
+    distance, _ = b.tree.query(np.ascontiguousarray(points), k=1)
     return bool(np.mean(distance < 1e-4 * b.spacing) > 0.9)
 
 

@@ -73,11 +73,18 @@ class PlacedViews:
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
 
+    @property
+    def torn_in_place(self) -> set[int]:
+        """Torn views of which one half is in its place, or that common targets hold there: not displaced as a whole."""
+        return set(self.torn) - set(self.unplaced)
+
 
 @dataclass(frozen=True)
 class Snooping(PlacedViews):
     """What linkage and tests say about the views of one capture."""
 
+    capture: Capture
+    T_mount: Array  # (4, 4) hand-eye under which they were tested
     misplaced: tuple[MisplacedView, ...]
     suspected: tuple[MisplacedView, ...]  # stand out, but usual effects of the arm would do that too
     steps: tuple[PoseStep, ...]  # from some view on the part or the scanner sits elsewhere
@@ -128,11 +135,7 @@ class Snooping(PlacedViews):
 
 
 def snoop_views(
-    capture: Capture,
-    T_mount: Array,
-    gate: float,
-    unconstrained: UnconstrainedPoses | None = None,
-    usual: UsualEffects | None = None,
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None = None
 ) -> Snooping:
     """Return which views of a capture do not belong where the robot has them, and steps, under a hand-eye.
 
@@ -141,49 +144,43 @@ def snoop_views(
 
     Args:
         T_mount: (4, 4) corrected hand-eye.
-        gate: largest distance between corresponding points at the end of the correction, length_unit.
-        unconstrained: the views moved by the overlaps alone; None: computed here.
+        unconstrained: the views moved by the overlaps alone.
         usual: effects that an arm may have; asked only where a view stands out or there is a step. None: no effects.
-
-    Raises:
-        NoResultError: no two views overlap.
     """
     model_poses = capture.poses(T_mount)
-    if unconstrained is None:
-        unconstrained = unconstrained_poses(capture, model_poses, gate)
-    else:
-        unconstrained = unconstrained.relative_to(model_poses)
+    unconstrained = unconstrained.relative_to(model_poses)
     located = place_views(capture, *_place_across_steps(capture, T_mount, unconstrained, usual))
     located = replace(located, unconstrained=located.unconstrained.relative_to(model_poses))
     model = view_model(capture, T_mount, located.unconstrained)
     tests = pose_tests(model, located.unconstrained, located.unplaced, list(located.placed), usual)
     expected = expected_poses(model, model_poses, located.unconstrained, tests) if tests.steps else model_poses
     standing_out = _displaced_views(capture, model, expected, located, tests)
-    # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
-    torn = {v for v in located.torn if v not in located.unplaced}
-    misplaced_views = {m.view for m in standing_out}
-    if misplaced_views and usual is not None:
+    misplaced, suspected = standing_out, list[MisplacedView]()
+    if standing_out and usual is not None:
         # Only those are misplaced that stand out even beside usual effects of the arm; the others are suspected.
         with_usual = model.with_usual(usual.twists(located.unconstrained))
         beside_usual = find_blunders(with_usual, tests.excluded, tests.steps)
-        misplaced_views &= set(beside_usual.blunders) | tests.beyond_effects | torn
-    # Views whose overlaps hold no other view in its place.
-    holding_nothing = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
+        sure = {*beside_usual.blunders, *tests.beyond_effects, *located.torn_in_place}
+        misplaced = [m for m in standing_out if m.view in sure]
+        suspected = [m for m in standing_out if m.view not in sure]
+    # Lines, and torn scans without a place, hold no other view in its place.
+    holding_nothing = {*located.lines, *(set(located.torn) - located.torn_in_place)}
     groups = linkage(located.unconstrained.overlaps, holding_nothing).components
     foreign = [
         MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, None)
         for v in located.unplaced
         if (v,) in groups
     ]
-    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in misplaced_views]
     few = None
     accused = misplaced or foreign or tests.steps or tests.null_projector.degrees < 1
     if usual is not None and _FEWEST <= model.count <= FEW_VIEWS and not accused:
         few = weigh_few_views(usual.measurement, usual.model, located.unconstrained, model)
     return Snooping(
         **vars(located),
+        capture=capture,
+        T_mount=T_mount,
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
-        suspected=tuple(m for m in standing_out if m.view not in misplaced_views),
+        suspected=tuple(suspected),
         steps=tests.steps,
         disconnected=tuple(group for group in groups if not set(group) <= {m.view for m in foreign}),
         model=model,
@@ -242,7 +239,7 @@ def place_views(capture: Capture, model_poses: Array, unconstrained: Unconstrain
     torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
     links = linkage(unconstrained.overlaps, {*lines, *torn})
     needed = needed_closure(capture, unconstrained.poses, links, tolerance)
-    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, links, (tolerance, needed))
+    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, links, tolerance, needed)
     if placed and len(links.unlinked) > 1:
         # One displacement of all explains more than one of each, which may have closed in a wrong place.
         together = _place_together(capture, model_poses, unconstrained, placed, links.unlinked, tolerance)
@@ -315,16 +312,16 @@ def _displaced_views(
     unconstrained = located.unconstrained
     blunders = sorted((*tests.unlinked_blunders, *tests.blunders))
     surface_poses = {v: _refine_pose(capture, unconstrained, v, located.tolerance) for v in blunders}
-    surface_poses |= {v: unconstrained.poses[v] for v in located.torn if v not in {*blunders, *located.unplaced}}
+    surface_poses |= {v: unconstrained.poses[v] for v in located.torn if v in located.torn_in_place - {*blunders}}
     displaced = []
     for v, T in surface_poses.items():
         centroid = capture.scans[v].points.mean(axis=0)[None]
         centroid_in_reference = frames.transform(unconstrained.poses[v], centroid)[0]
-        others = [w for w in tests.standing_off if w != v]
-        least = least_displacement(model, tests, others, tests.steps, v, centroid_in_reference)
+        least = least_displacement(model, tests, v, centroid_in_reference)
         turn = float(frames.angle_between(expected[v], T))
         shift = float(np.linalg.norm(frames.transform(T, centroid) - frames.transform(expected[v], centroid)))
-        displaced.append(MisplacedView(v, "displaced", turn, shift, T, least))
+        kind = "torn" if v in located.torn_in_place else "displaced"
+        displaced.append(MisplacedView(v, kind, turn, shift, T, least))
     return displaced
 
 

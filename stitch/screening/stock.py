@@ -80,17 +80,13 @@ _UNUSUAL = 0.01
 _SHAPE, _TIMES_USUAL, _OFFSET, _MOST_ASKED = 0.5, 2.0, 4.0, 4
 
 
-def find_stock(
-    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
-) -> Mapping[int, Stock | None]:
+def find_stock(session: SessionData, snooping: Snooping) -> Mapping[int, Stock | None]:
     """Return the stock of the view that shows it most clearly, by its number; {} where none does.
 
     The caller takes it off and asks again. If the scanner has unusual errors over its field, or stock was found on too
     many views, it was no stock: then the result is None for each view from which it was taken, to be given back.
-
-    Args:
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
     """
+    capture, T_mount = snooping.capture, snooping.T_mount
     unconstrained = snooping.unconstrained
     scatter = repeatability_from(snooping.blunder_search.fit.variances)
     off = sorted({m.view for m in (*snooping.misplaced, *snooping.suspected)})
@@ -189,10 +185,10 @@ def _shape_left(capture: Capture, unconstrained: UnconstrainedPoses) -> Array:
         patch = _patches(capture.scans[v], np.concatenate([m.index_v for m in matches]))
         order = np.argsort(patch, kind="stable")
         parts = np.split(e[order], np.cumsum(np.bincount(patch))[:-1])
-        shown = [(len(part), float(np.median(part))) for part in parts if len(part) >= _NEIGHBOURS]
-        if shown:
-            count, middle = np.array(shown).T
-            left[v] = np.sqrt(count @ middle**2 / count.sum()) / unconstrained.overlaps.gram.scale
+        medians = [(len(part), float(np.median(part))) for part in parts if len(part) >= _NEIGHBOURS]
+        if medians:
+            count, median = np.array(medians).T
+            left[v] = np.sqrt(count @ median**2 / count.sum()) / unconstrained.overlaps.gram.scale
     return left
 
 
@@ -248,27 +244,24 @@ def stock_of(
 
 @dataclass(frozen=True)
 class _Case:
-    """One view, and what the others and the robot say of where all of them are."""
+    """One of V views, with what the other views and the robot say of where all of them are."""
 
     capture: Capture
     view: int
-    start: Array  # (V, 4, 4) T_reference_scanner
+    start: Array  # (V, 4, 4) T_reference_scanner: the view by the robot, the others where their overlaps put them
     centre: Array  # (3,) about which twists count, reference frame
     H: Array  # (6V, 6V) of the overlaps of the others, in units of their noise
     b: Array  # (6V,)
     twists: Array  # (6V,) from the robot's poses to `start`
     held: Array  # (6V, 6V) precision of the robot's poses, their mean free
     free: Array  # (6V, 6V) the same, the view itself at any pose
-    gate: float
-    sigma: float  # robust, of a distance
+    gate: float  # largest distance between corresponding points, length_unit
+    sigma: float  # robust, of a distance, length_unit
     factor: float  # of its variance: distances share points
     scatter: float  # of the robot's poses, length_unit
 
-    def distances(self, x: Array, offset: Array) -> tuple[Array, Array, Indices, Array, Array] | None:
-        """Return M correspondences of the view with the others as five arrays; None for fewer than `_FEWEST`.
-
-        They are signed distances (M,), length_unit; weights (M,); numbers (M,) of the view's points; cosines (M,)
-        between their normals and the mean ones; and the change (M, 6V) of the distances by twists of all views.
+    def distances(self, x: Array, offset: Array) -> "_Distances | None":
+        """Return the distances of the view's points from the surface of the others; None for fewer than `_FEWEST`.
 
         Args:
             x: (6V,) left twists of the views about `centre` from `start`.
@@ -286,14 +279,25 @@ class _Case:
         if sum(len(m.residual) for m in matches) < _FEWEST:
             return None
         columns = zip(*(m.columns for m in matches), strict=True)
-        midpoint, normal, residual, weight, index, _ = (np.concatenate(column) for column in columns)
+        midpoint, normal, distance, weight, index, _ = (np.concatenate(column) for column in columns)
         view_rows = frames.plane_rows(midpoint - self.centre, normal)
         partner = np.repeat([m.w for m in matches], [len(m.residual) for m in matches])
-        rows = np.zeros((len(residual), len(poses), 6))
+        rows = np.zeros((len(distance), len(poses), 6))
         rows[:, self.view] = view_rows
-        rows[np.arange(len(residual)), partner] -= view_rows
+        rows[np.arange(len(distance)), partner] -= view_rows
         cosine = np.einsum("ni,ni->n", frames.rotate(poses[self.view], scan.normals[index]), normal)
-        return residual, weight, index, cosine, rows.reshape(len(residual), -1)
+        return _Distances(distance, weight, index, cosine, rows.reshape(len(distance), -1))
+
+
+@dataclass(frozen=True)
+class _Distances:
+    """Distances of M points of the view from the surface of the others."""
+
+    distance: Array  # (M,) signed, along the mean normals of view and surface, length_unit
+    weight: Array  # (M,)
+    index: Indices  # (M,) numbers of the view's points
+    cosine: Array  # (M,) between their normals and the mean normals
+    by_twists: Array  # (M, 6V) change of the distances by twists of all views
 
 
 def _hold_against_others(
@@ -311,34 +315,61 @@ def _hold_against_others(
         usual: (6,) usual rotations (rad) and translations (length_unit) of a flange: the scatter is no less than a
             share of it.
     """
-    poses = capture.poses(T_mount)
-    middles = frames.transform(poses, np.array([[scan.points.mean(axis=0)] for scan in capture.scans]))[:, 0]
-    near = np.argsort(np.linalg.norm(middles - middles[view], axis=1), kind="stable")
-    gone = np.array(sorted({*off, *near[_MOST_VIEWS:].tolist()} - {view}), np.int64)
-    kept = np.setdiff1d(np.arange(len(poses)), gone)
-    capture, poses, view = capture.without(gone), poses[kept], int(np.searchsorted(kept, view))
-    others = np.delete(np.arange(len(kept)), view)
-    if len(others) < _FEWEST_VIEWS:
+    kept = _views_to_compare(capture, T_mount, view, off)
+    if len(kept) - 1 < _FEWEST_VIEWS:
         return None
+    poses = capture.poses(T_mount)[kept]
+    capture = capture.without(np.setdiff1d(np.arange(len(capture.scans)), kept))
+    view = int(np.searchsorted(kept, view))
+    others = np.delete(np.arange(len(kept)), view)
     rest = capture.without(np.array([view]))
     unconstrained = unconstrained_poses(rest, poses[others], gate)
     g = unconstrained.overlaps.gram
-    mean = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
-    at = (6 * others[:, None] + np.arange(6)).ravel()
     variances = view_model(rest, T_mount, unconstrained).fit().variances
     rotation, translation = np.maximum(np.sqrt(variances[:2]), _LEAST_SCATTER * usual[[0, 3]]).tolist()
     factor = max(float(variances[2]), 1.0)
-    H, b, twists = np.zeros((6 * len(kept), 6 * len(kept))), np.zeros(6 * len(kept)), np.zeros(6 * len(kept))
-    H[np.ix_(at, at)], b[at] = (part / (g.variance * factor) for part in assemble(g))
-    twists[at] = unconstrained.twists.ravel()
+    # The others' normal equations among those of all views: the view itself has zeros.
+    count = 6 * len(kept)
+    rows = (6 * others[:, None] + np.arange(6)).ravel()
+    H = np.zeros((count, count))
+    b = np.zeros(count)
+    twists = np.zeros(count)
+    H[np.ix_(rows, rows)], b[rows] = (part / (g.variance * factor) for part in assemble(g))
+    twists[rows] = unconstrained.twists.ravel()
     start = np.array(poses)
     start[others] = unconstrained.poses
+    mean = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
     precision = prior_precision(capture, Repeatability(rotation, translation, factor), g.centre)
     held = with_free_mean(precision, mean)
     precision[view] = 0.0
-    free = with_free_mean(precision, mean)
-    gate = unconstrained.overlaps.gate
-    return _Case(capture, view, start, g.centre, H, b, twists, held, free, gate, g.scale, factor, translation)
+    return _Case(
+        capture,
+        view,
+        start,
+        g.centre,
+        H,
+        b,
+        twists,
+        held,
+        free=with_free_mean(precision, mean),
+        gate=unconstrained.overlaps.gate,
+        sigma=g.scale,
+        factor=factor,
+        scatter=translation,
+    )
+
+
+def _views_to_compare(capture: Capture, T_mount: Array, view: int, off: Collection[int]) -> Indices:
+    """Return the sorted numbers of a view and of the `_MOST_VIEWS` − 1 views nearest to it, without those that are off.
+
+    Args:
+        T_mount: (4, 4) hand-eye that places the scans.
+        off: views that are left out; `view` itself stays.
+    """
+    centroids = np.array([[scan.points.mean(axis=0)] for scan in capture.scans])
+    placed = frames.transform(capture.poses(T_mount), centroids)[:, 0]
+    nearest = np.argsort(np.linalg.norm(placed - placed[view], axis=1), kind="stable")[:_MOST_VIEWS]
+    return np.union1d(np.setdiff1d(nearest, list(off)), [view]).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -360,33 +391,29 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
     on a region of it. Each step matches anew, finds the region, and takes a Gauss–Newton step of twists and thickness;
     the scale of the robust weights is halved from that of all distances to that of noise.
     """
-    K = case.free if kind == "moved" else case.held
+    precision = case.free if kind == "moved" else case.held
     # The start: minimum of the others' normal equations with the robot's prior.
     x = -symmetric_inverse(case.H + case.held) @ (case.b + case.held @ case.twists)
-    scan = case.capture.scans[case.view]
     thickness, scale = 0.0, np.inf
-    points = np.zeros(len(scan.points), bool)
+    scanned = case.capture.scans[case.view].points
+    points = np.zeros(len(scanned), bool)
     for _ in range(_STEPS):
-        distances = case.distances(x, thickness * points)
-        if distances is None:
+        found = case.distances(x, thickness * points)
+        if found is None:
             return None
-        e, weight, index, cosine, by_twists = distances
-        e = e + thickness * cosine * points[index]
-        member, edge = np.zeros((2, len(e)), bool)
+        index, weight = found.index, found.weight
+        # Distances of the points where the scan has them, its stock not taken off.
+        distance = found.distance + thickness * found.cosine * points[index]
+        member, edge = np.zeros((2, len(distance)), bool)
         if kind == "stock":
-            thickness, member, edge = _region(scan.points[index], e, thickness, case.sigma)
+            thickness, member, edge = _region(scanned[index], distance, thickness, case.sigma)
         if member.any():
-            points = member[KDTree(scan.points[index]).query(scan.points)[1]]
-        rows = np.column_stack([by_twists, -cosine * member])
-        residual = e + thickness * rows[:, -1]
+            points = member[KDTree(scanned[index]).query(scanned)[1]]
+        rows = np.column_stack([found.by_twists, -found.cosine * member])
+        residual = distance + thickness * rows[:, -1]
         scale = max(case.sigma, min(scale, mad_sigma(residual)))
-        w = weight * tukey(residual, scale) * ~edge / (case.sigma**2 * case.factor)
-        H = (rows.T * w) @ rows
-        H[:-1, :-1] += case.H + K
-        gradients = rows * (w * residual)[:, None]
-        gradient = gradients.sum(axis=0)
-        gradient[:-1] += case.b + case.H @ x + K @ (case.twists + x)
-        change = -symmetric_inverse(H) @ gradient
+        robust_weight = weight * tukey(residual, scale) * ~edge / (case.sigma**2 * case.factor)
+        change, information, gradients = _gauss_newton_step(case, precision, x, rows, residual, robust_weight)
         x = x + change[:-1]
         thickness += float(change[-1])
         largest_change = max(np.abs(change[:-1].reshape(-1, 6)[:, 3:]).max(), abs(change[-1]))
@@ -395,24 +422,66 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
         if largest_change < _NEAR * scale:
             scale /= 2
     inside = member & ~edge
-    if kind == "stock" and not w[inside].any():
+    if kind == "stock" and not robust_weight[inside].any():
         # No region is left, or robust weights reject all of it.
         return None
-    t = case.twists + x
-    pose_cost = 0.5 * float(t @ K @ t + x @ case.H @ x) + float(case.b @ x)
-    share = float(scan.area[points].sum() / scan.area.sum())
-    # Distances within a patch err together: the thickness varies by the gradient of each patch (sandwich), and by no
-    # less than the normal equations say.
-    of_patches = np.zeros((len(e), len(H)))
-    np.add.at(of_patches, _patches(scan, index), gradients)
-    gain = symmetric_inverse(H)[-1]
-    variance = gain[:-1] @ (case.H + K) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
-    sigma = float(np.sqrt(max(variance, gain[-1])))
-    of_view = rows[:, 6 * case.view : 6 * case.view + 6]
+    area = case.capture.scans[case.view].area
     over_torn = np.inf
     if inside.any():
-        over_torn = _over_torn(case, *(column[inside] for column in (of_view, e, residual, weight)))
-    return _Fit(thickness, sigma, points, share, _evidence(case, residual, weight) - pose_cost, over_torn)
+        of_view = rows[:, 6 * case.view : 6 * case.view + 6]
+        over_torn = _over_torn(case, of_view[inside], distance[inside], residual[inside], weight[inside])
+    t = case.twists + x
+    pose_cost = 0.5 * float(t @ precision @ t + x @ case.H @ x) + float(case.b @ x)
+    return _Fit(
+        thickness=thickness,
+        sigma=_thickness_sigma(case, precision, information, gradients, index),
+        points=points,
+        share=float(area[points].sum() / area.sum()),
+        evidence=_evidence(case, residual, weight) - pose_cost,
+        over_torn=over_torn,
+    )
+
+
+def _gauss_newton_step(
+    case: _Case, precision: Array, x: Array, rows: Array, residual: Array, weight: Array
+) -> tuple[Array, Array, Array]:
+    """Return one Gauss–Newton step (6V + 1,) of the twists and the thickness, with the sums that lead to it.
+
+    The cost is that of the weighted residuals, of the others' overlaps, and of the poses under the robot's prior.
+
+    Args:
+        precision: (6V, 6V) of the poses by the robot.
+        x: (6V,) twists so far.
+        rows: (M, 6V + 1) change of the residuals by twists and thickness.
+        residual, weight: (M,) each; weights in 1/length_unit².
+
+    Returns:
+        The step; the information (6V + 1, 6V + 1); and the gradient of each residual's share of the cost, (M, 6V + 1).
+    """
+    information = (rows.T * weight) @ rows
+    information[:-1, :-1] += case.H + precision
+    gradients = rows * (weight * residual)[:, None]
+    gradient = gradients.sum(axis=0)
+    gradient[:-1] += case.b + case.H @ x + precision @ (case.twists + x)
+    return -symmetric_inverse(information) @ gradient, information, gradients
+
+
+def _thickness_sigma(case: _Case, precision: Array, information: Array, gradients: Array, index: Indices) -> float:
+    """Return the standard error of a fitted thickness: of a sandwich, but no less than by the normal equations.
+
+    Distances within a patch err together: the thickness varies by the summed gradient of each patch.
+
+    Args:
+        precision: (6V, 6V) of the poses by the robot.
+        information: (6V + 1, 6V + 1) of twists and thickness, the last.
+        gradients: (M, 6V + 1) of each distance's share of the cost.
+        index: (M,) number of the view's point of each distance.
+    """
+    of_patches = np.zeros_like(gradients)
+    np.add.at(of_patches, _patches(case.capture.scans[case.view], index), gradients)
+    gain = symmetric_inverse(information)[-1]
+    variance = gain[:-1] @ (case.H + precision) @ gain[:-1] + np.sum((of_patches @ gain) ** 2)
+    return float(np.sqrt(max(variance, gain[-1])))
 
 
 def _evidence(case: _Case, left: Array, weight: Array) -> float:

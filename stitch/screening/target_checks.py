@@ -170,5 +170,5 @@ def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> float:
         return np.inf
     placed = frames.transform(posed.poses(T_mount), s.points)
     by_target = [placed[s.used & (s.target == k)] for k in range(len(s.targets))]
-    apart = [np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in by_target if len(p) > 1]
-    return float(np.median(np.concatenate(apart))) if apart else np.inf
+    distances = [np.linalg.norm(p - np.median(p, axis=0), axis=1) for p in by_target if len(p) > 1]
+    return float(np.median(np.concatenate(distances))) if distances else np.inf

@@ -301,9 +301,15 @@ def left_out_test(
     return tested, f_tail(tested.statistic / degrees, degrees, free)
 
 
-def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
-    """Test one view under the scatter that all others have without it: where a scan slides it rests anywhere."""
-    return left_out_test(model, columns, model.views[view], model.held_responses[view])
+def leave_one_out_p_value(model: ViewModel, columns: Array | None, view: int) -> float:
+    """Return the p-value of a displacement of one view, under the scatter that all others have without it.
+
+    Directions in which its scan slides along the others are free, and not tested.
+
+    Args:
+        columns: (n, K) of all else in the mean; None: none.
+    """
+    return left_out_test(model, columns, model.views[view], model.held_responses[view])[1]
 
 
 def displacement_lower_bound(tested: AlternativeTest, degrees: int) -> Array:

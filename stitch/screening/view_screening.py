@@ -187,11 +187,10 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         NoResultError: they do, and none does; or two views alone do; or groups of views share no surface.
     """
     capture = correction.captures[index]
-    T_mount = correction.geometry.T_mount
     if correction.given:
         require_matching_hand_eye(session, measurement, correction, index)
     snooping = _snoop_session(session, measurement, correction, index)
-    if stock := find_stock(session, capture, T_mount, snooping):
+    if stock := find_stock(session, snooping):
         return ViewScreening(stock=stock)
     if poses_contradict_scans(session, snooping):
         refuse_contradiction(session, snooping, given=correction.given)
@@ -204,7 +203,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
     # Before small steps are dropped: the warnings tell of them.
-    warnings = snooping_warnings(session, capture, snooping, T_mount)
+    warnings = snooping_warnings(session, snooping)
     if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
         # A slip of the part, or a knock of the mount, that effects can describe is left to the diagnosis: no view
         # beyond it is left out.
@@ -212,9 +211,9 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
     # Of few views the warnings weigh all poses together: no single one is suspected beside that.
     suspected = snooping.suspected if snooping.few is None else ()
     names = session.names
-    poses = capture.poses(T_mount)
+    poses = capture.poses(snooping.T_mount)
     return ViewScreening(
-        left_out=_misplaced_views(session, capture, T_mount, snooping),
+        left_out=_misplaced_views(session, snooping, poses),
         suspected=tuple(_excluded_view(session, m.view, suspicion_in_words(session, m), poses) for m in suspected),
         links=ViewLinks(
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
@@ -237,22 +236,19 @@ def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Itera
             yield sentence("copies", views=f"{session.names[v]} and {session.names[w]}")
 
 
-def _misplaced_views(
-    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
-) -> tuple[ExcludedView, ...]:
+def _misplaced_views(session: SessionData, snooping: Snooping, poses: Array) -> tuple[ExcludedView, ...]:
     """Return the views that are left out, each with the reason.
 
     Args:
-        T_mount: (4, 4) hand-eye under which `snooping` was made.
+        poses: (V, 4, 4) T_reference_scanner of all views under the model.
 
     Raises:
         NoResultError: the views are groups that share no surface.
     """
-    problems = explain_misplaced(session, capture, T_mount, snooping) if snooping.left_out else []
-    apart = next((problem for problem in problems if problem.mistake == "groups"), None)
-    if apart is not None:
-        raise NoResultError(f"{session.path}: {apart.line(session.names)}")
-    poses = capture.poses(T_mount)
+    problems = explain_misplaced(session, snooping) if snooping.left_out else []
+    separate_groups = next((problem for problem in problems if problem.mistake == "groups"), None)
+    if separate_groups is not None:
+        raise NoResultError(f"{session.path}: {separate_groups.line(session.names)}")
     # A view with several problems has the reason of the first.
     why = {name: problem.line(session.names) for problem in reversed(problems) for name in problem.views}
     return tuple(
@@ -294,7 +290,7 @@ def session_warnings(
         return of_targets
     snooping = _snoop_session(session, measurement, correction, index)
     capture = correction.captures[index]
-    warnings = snooping_warnings(session, capture, snooping, correction.geometry.T_mount)
+    warnings = snooping_warnings(session, snooping)
     return (*of_targets, *(problem.fix for problem in stock_problems(session, capture)), *warnings)
 
 
@@ -307,7 +303,6 @@ def _snoop_session(session: SessionData, measurement: Measurement, correction: C
     snooping = snoop_views(
         correction.captures[index],
         correction.geometry.T_mount,
-        correction.overlaps[index].gate,
         correction.unconstrained[index],
         UsualEffects(measurement, correction.geometry),
     )

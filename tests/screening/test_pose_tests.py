@@ -108,8 +108,8 @@ def partly_shown(shown, blunder, seed=0):
 
 
 def least_of_one(model):
-    found = replace(find_blunders(model), fit=at_variances(model.mixed(), np.array([SIGMA**2, SIGMA**2, 1.0])))
-    return least_displacement(model, found, [], (), OFF, np.zeros(3))
+    fit = at_variances(model.mixed(), np.array([SIGMA**2, SIGMA**2, 1.0]))
+    return least_displacement(model, replace(find_blunders(model), fit=fit, blunders=()), OFF, np.zeros(3))
 
 
 def test_what_every_direction_shows_is_shorter_by_the_radius_of_its_confidence():
@@ -166,7 +166,7 @@ def wandering(seed, wanders=0.0):
 
 
 def steps(model):
-    return find_steps(model, None, (None, 0), 0.01)
+    return find_steps(model, None, None, 0.01)
 
 
 def stepped(model, *starts, times=30.0):
@@ -203,7 +203,7 @@ def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
     model = stepped(wandering(8), STEP_VIEWS - 1, times=100.0)
     singles = find_blunders(replace(model, errors=None))
     assert singles.blunders == (STEP_VIEWS - 1,)
-    assert find_steps(model, None, (singles.mean_columns, 1), 0.01) == ()
+    assert find_steps(model, None, singles.mean_columns, 0.01) == ()
 
 
 def with_one_off(model, view, times=100.0):
@@ -222,20 +222,20 @@ def test_a_step_is_found_beside_a_view_farther_off():
 
 def test_half_of_the_views_let_go_explain_a_step_no_better_than_the_step():
     model = stepped(wandering(11), 9)
-    (found,) = find_steps(model, None, (model.columns(range(9, STEP_VIEWS)), 9), 0.01)
+    (found,) = find_steps(model, None, model.columns(range(9, STEP_VIEWS)), 0.01)
     assert found.start == 9
 
 
 def test_where_every_view_stands_free_no_step_is_sought():
     """Left out and let go until nothing was left to be tested: the search ended in an error."""
-    assert find_steps(wandering(10), wandering(10).columns(range(STEP_VIEWS - 1)), (None, 0), 0.01) == ()
+    assert find_steps(wandering(10), wandering(10).columns(range(STEP_VIEWS - 1)), None, 0.01) == ()
 
 
 def test_of_six_views_every_start_of_a_step_may_be_taken():
     """What is likeliest then is a single view: the search ended in an error."""
     z = SIGMA * np.random.default_rng(0).standard_normal(36)
     model = direct_views(z, errors=PoseErrors(("white",), SIGMA**2 * np.eye(36)[None], np.ones(1)))
-    pick = pose_tests._next_pick(model, None, [dict.fromkeys(pose_tests.MOVED_BODIES, k) for k in (2, 3, 4)])
+    pick = pose_tests._next_pick(model, None, {2, 3, 4})
     assert pick is not None and pick.starts is None
     assert pick.columns.shape == (36, 6) and pick.tests == 6
 
