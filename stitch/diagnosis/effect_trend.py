@@ -150,9 +150,8 @@ def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement
         offset = _term_at_zero(linear, EFFECTS["joint_offset"])
         return next(pose_derivatives(measurement, bare, [offset], centre))[motion.joint, 0]
     if motion.twist is not None:
-        return (
-            motion.twist @ next(pose_derivatives(measurement, bare, [_term_at_zero(linear, _CONSTANT)], centre))[:, 0]
-        )
+        constant = _term_at_zero(linear, _CONSTANT)
+        return motion.twist @ next(pose_derivatives(measurement, bare, [constant], centre))[:, 0]
     return np.append(np.zeros(3), motion.per_unit[0, -3:])
 
 

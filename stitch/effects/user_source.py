@@ -61,7 +61,8 @@ def _collect(name: str, value: Any, where: str, imports: dict[str, None], pieces
     if name in pieces:
         return
     if isinstance(value, ModuleType):
-        _require_installed(value, name, where)
+        if not _is_installed(value):
+            raise InputError(f"{where}: names {name}, a module that other programs do not find; {_FIX}")
         imports[f"import {value.__name__} as {name}"] = None
     elif isinstance(value, (FunctionType, type)) and not _is_installed(sys.modules.get(value.__module__)):
         pieces[name] = ""  # marked as begun: two functions that call each other would not end
@@ -126,11 +127,6 @@ def _is_installed(module: ModuleType | None) -> bool:
         return True
     paths = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "purelib", "platlib")]
     return any(Path(file).resolve().is_relative_to(path) for path in paths)
-
-
-def _require_installed(module: ModuleType, name: str, where: str) -> None:
-    if not _is_installed(module):
-        raise InputError(f"{where}: names {name}, a module that other programs do not find; {_FIX}")
 
 
 def _require_literal(name: str, value: Any, where: str) -> None:
