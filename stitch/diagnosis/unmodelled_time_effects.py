@@ -12,7 +12,7 @@ single joints that follow the joint angles, or the angles that they come from, b
 wanders in time: smooth processes of few numbers each and of a size that the views tell (`unmodelled_trends`).
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -69,11 +69,6 @@ ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
 # What poses do that err by a kind of components.
 _FOLLOW_JOINTS, _WANDER_IN_TIME = "follow the joints", "wander in time"
 
-# Times (T,) in steps from view to view → shapes (T, R) of a process.
-_Trend = Callable[[Array], Array]
-# Its kind, in words, and with its frequency if it is a swing.
-_DescribedTrend = tuple[str, str, _Trend, float | None]
-
 
 def time_processes(linear: LinearModel) -> list[SmoothProcess]:
     """Return all courses in time that are tried for the flange: swings of many periods, and stretches of many lengths.
@@ -84,14 +79,11 @@ def time_processes(linear: LinearModel) -> list[SmoothProcess]:
     span = max(float(np.ptp(time)), 1.0)
     spacing = max(limits.FREQUENCY_STEP / span, limits.FASTEST_SWING / limits.MOST_FREQUENCIES)
     frequencies = np.arange(limits.LEAST_SWINGS / span, limits.FASTEST_SWING, spacing)
-    swings = list(_swings(linear, frequencies))
+    carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
+    swings = _swings(linear, carried, frequencies)
     # With one phase for all six motions, as where one temperature moves them: half as many numbers.
-    in_phase = [
-        (_SWING_IN_PHASE, words, partial(_wave_at_phase, waves, k * np.pi / _PHASES), frequency)
-        for _, words, waves, frequency in swings
-        for k in range(_PHASES)
-    ]
-    return _processes(linear, time, [*swings, *in_phase, *_stretches(linear, time)])
+    in_phase = _swings(linear, carried, frequencies, [k * np.pi / _PHASES for k in range(_PHASES)])
+    return [*swings, *in_phase, *_stretches(linear, carried, time)]
 
 
 def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | None:
@@ -161,9 +153,8 @@ def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProce
     reach = limits.FREQUENCY_STEP / max(float(np.ptp(time)), 1.0)
     frequencies = frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)
     beside = replace(base, null=swing.fit)
-    process, size, _ = max(
-        _sized(beside, _processes(base, time, _swings(base, frequencies))), key=lambda sized: sized[2]
-    )
+    swings = _sized(beside, _swings(base, swing.process.motions, frequencies))
+    process, size, _ = max(swings, key=lambda sized: sized[2])
     return fit_process(base, process, size, tried=1)
 
 
@@ -172,23 +163,21 @@ def _sized(linear: LinearModel, processes: Iterable[SmoothProcess]) -> list[tupl
     return [(process, *size_process(linear, process)) for process in processes]
 
 
-def _processes(linear: LinearModel, time: Array, trends: Iterable[_DescribedTrend]) -> list[SmoothProcess]:
-    """Return processes of a flange that moves by these trends, along and about every axis of its own frame.
+def _swings(
+    linear: LinearModel, carried: Array, frequencies: Array, phases: Sequence[float] = ()
+) -> Iterator[SmoothProcess]:
+    """Yield the swings of the flange with each frequency (1/step).
 
     Args:
-        time: (V,) of the views, in steps.
+        carried: (V, 6, 6) twists of the views per unit motion of the flange, along and about each of its axes.
+        phases: rad; one swing of each, in which all six motions move at once. (): each motion has a phase of its own.
     """
-    carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
-    return [
-        SmoothProcess(None, carried, trend(time), kind, words, trend, frequency)
-        for kind, words, trend, frequency in trends
-    ]
-
-
-def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedTrend]:
-    """Yield the trend of a swing for each frequency (1/step); all six motions swing with phases of their own."""
+    time = time_in_steps(linear.measurement)
     for f in map(float, frequencies):
-        yield _SWING, f"swing to and fro about every {_duration_in_words(linear, 1 / f)}", partial(_waves, f), f
+        words = f"swing to and fro about every {_duration_in_words(linear, 1 / f)}"
+        trends = [partial(_wave_at_phase, f, phase) for phase in phases] if phases else [partial(_waves, f)]
+        for trend in trends:
+            yield SmoothProcess(None, carried, trend(time), _SWING_IN_PHASE if phases else _SWING, words, trend, f)
 
 
 def _waves(frequency: float, time: Array) -> Array:
@@ -197,15 +186,16 @@ def _waves(frequency: float, time: Array) -> Array:
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
-def _wave_at_phase(waves: _Trend, phase: float, time: Array) -> Array:
-    """Return the sine (T, 1) with one phase (rad) of those that `waves` gives as cosine and sine (T, 2)."""
-    return waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]])
+def _wave_at_phase(frequency: float, phase: float, time: Array) -> Array:
+    """Return the wave (T, 1) of a frequency (1/step) with one phase (rad), at times (T,) in steps."""
+    return _waves(frequency, time) @ np.array([[np.cos(phase)], [np.sin(phase)]])
 
 
-def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedTrend]:
-    """Yield the trends of stretches: Gaussian bumps that begin and end within the session, from narrow to wide.
+def _stretches(linear: LinearModel, carried: Array, time: Array) -> Iterator[SmoothProcess]:
+    """Yield the flange's stretches: Gaussian bumps that begin and end within the session, from narrow to wide.
 
     Args:
+        carried: (V, 6, 6) twists of the views per unit motion of the flange, along and about each of its axes.
         time: (V,) of the views, in steps.
     """
     first = float(time.min())
@@ -221,7 +211,8 @@ def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedTrend]:
             if np.count_nonzero(distance < _FULL_WIDTH / 2) >= limits.STRETCH_VIEWS:
                 name = views.names[views.number[distance.argmin()]]
                 words = f"are off for a stretch of {_duration_in_words(linear, _FULL_WIDTH * width)} about view {name}"
-                yield _STRETCH, words, partial(_bump, middle, width), None
+                trend = partial(_bump, middle, width)
+                yield SmoothProcess(None, carried, trend(time), _STRETCH, words, trend)
         width *= 2
 
 
