@@ -151,7 +151,8 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
     from stitch.model.model import uncertainty_scope
     from stitch.output.finding_screen import unseen_text, untested_text
 
-    if (rest := 1 - sum(c.ranked.posterior for c in diagnosis.candidates)) > _MIN_POSTERIOR_SHARE:
+    rest = 1 - sum(c.ranked.posterior for c in diagnosis.candidates)
+    if rest > _MIN_POSTERIOR_SHARE and any(c.ranked.score.observable for c in diagnosis.candidates):
         say(f"Probability that no known effect is missing: {rest:.2f}.")
     for c in listed:
         if c.ranked.score.observable and (c.name in diagnosis.effects or c.ranked.adjusted < _CLEAR):
@@ -196,4 +197,4 @@ def _show_missed(diagnosis: Diagnosis, length_unit: str) -> None:
     known = sorted(((c.hand_eye, c.name) for c in diagnosis.candidates if c.hand_eye is not None), reverse=True)
     if sizes := ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3]):
         still = "Effects too small to be seen could still displace the hand-eye, at the part by"
-        say(f"{still} {sizes}. U anywhere the arm reaches counts them.")
+        say(f"{still} {sizes}. U anywhere the arm reaches counts them at usual sizes.")

@@ -143,7 +143,11 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         return None
     contenders = [r for r in evidence.ranked if is_contender(r)]
     if not contenders:
-        return Reply("none that could be named", ends=True)
+        shape = evidence.shape
+        assert shape is not None
+        formula = shape.score.candidate.effect.formula
+        note = f"what stands out has no known cause: {formula} (p = {shape.adjusted:.1g})"
+        return Reply("none that could be named", {"notes": (*evidence.notes, note)}, ends=True)
     first = contenders[0]
     # Random effects of the arm in the model can explain what a further contender would: without those of the known
     # contenders it may show. Each one that shows may reveal more.
@@ -228,7 +232,8 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
             beside = rank_one(conditioned_on_effects(case.linear, [second]), best.score.candidate, second.tests)
             pair = (best, second) if beside.log_posterior >= second.log_posterior else (second, beside)
             return Reply(f"not beside {second.name}", both_missing(pair))
-    return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
+    note = f"{best.name}: an error without a name explains these views as well"
+    return Reply("yes", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
 def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply | None:

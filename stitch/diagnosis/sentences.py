@@ -10,7 +10,7 @@ from stitch.diagnosis.law_ranking import law_size
 from stitch.diagnosis.ranking import Ranked, beyond_belief_text
 from stitch.diagnosis.residual_structure import NOT_REPEATING
 from stitch.diagnosis.systematic_laws import Law, law_of
-from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
+from stitch.diagnosis.thresholds import ALPHA, CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.effects.contract import EFFECTS
@@ -58,6 +58,8 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
         scales = f", beside scales of scanners that differ by {100 * SCALE_SIGMA:g} % (1 σ)," if several else ""
         yield f"The robot's poses scatter by {scatter} (1 σ), which{scales} explains the rest."
         yield _allowed(d, length_unit)
+        if d.translation > d.expected_scatter.translation or d.rotation > d.expected_scatter.rotation:
+            yield "What was found lies above that, by no more than chance explains."
     if d.scanner_error is not None:
         calibration = "" if d.scanner_error.by_view else ", but a calibration may"
         yield f"{scanner_error_sentence(d.scanner_error, length_unit)} No pose corrects that{calibration}."
@@ -155,7 +157,9 @@ def _step_like_what_lasts(d: Diagnosis) -> str:
 
 def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
     """Yield the sentences on an error without a name: laws, scanner, covariates, places, poses, untested effects."""
-    yield f"No effect of the library explains what is left. {_residual_sentence(d, length_unit)}"
+    yield f"Something is missing: {why_without_a_name(d)}. {_residual_sentence(d, length_unit)}"
+    if (nearest := _nearest(d)) is not None:
+        yield f"{nearest.name} comes nearest (p = {nearest.adjusted:.1g})."
     yield from _laws_found(d)
     if d.overlap_misfit:
         size = length_text(d.overlap_misfit, length_unit, 2)
@@ -181,6 +185,19 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
         yield f"Joint effects were not tested ({', '.join(untested)}): they need joint angles and the robot's geometry."
 
 
+def why_without_a_name(d: Diagnosis) -> str:
+    """Return as a clause why no effect is named: these views test none, none is clear enough, or none explains it."""
+    if not any(c.ranked.score.observable for c in d.candidates):
+        return "these views can test no known effect"
+    return "no known effect is clear enough to be named" if _nearest(d) else "no known effect explains it"
+
+
+def _nearest(d: Diagnosis) -> Ranked | None:
+    """Return the effect of the least p, where that is less than chance allows; None: there is none."""
+    likely = [c.ranked for c in d.candidates if c.ranked.score.observable and c.ranked.adjusted < ALPHA]
+    return min(likely, key=lambda ranked: ranked.adjusted, default=None)
+
+
 def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
     """Yield sentences on the pose errors where nothing is named: whether they repeat, and how much they scatter."""
     scatter = _scatter(d.translation, d.rotation, length_unit)
@@ -201,7 +218,7 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
         limits = _scatter(d.scatter_limit.translation, d.scatter_limit.rotation, length_unit)
         limit = f"{'stated' if d.scatter_limit.stated else 'usual'}: up to {limits}"
         yield f"The robot's pose errors dominate: they scatter by {scatter} ({limit})."
-        yield "Such errors repeat at the same poses, so a correction found on one object holds for another."
+        yield "If they repeat at the same poses, a correction found on one object holds for another: drive some twice."
 
 
 def _allowed(d: Diagnosis, length_unit: str) -> str:

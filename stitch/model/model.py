@@ -396,6 +396,6 @@ def uncertainty_scope(verdict: str | None) -> str:
     if verdict in ("missing_effect", "cannot_tell"):
         return "The ± of the hand-eye are too small until the effect is added."
     if verdict == "unknown_effect":
-        return "The ± of the hand-eye are too small: something without a name is missing."
+        return "The ± of the hand-eye hold for a complete model, and something without a name is missing."
     found = "no effect is found missing" if verdict == "adequate" else "whether an effect is missing has not been asked"
     return f"U of the hand-eye holds for a complete model; {found}."

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
-from stitch.diagnosis.sentences import odds_text, unnamed_in_words
+from stitch.diagnosis.sentences import odds_text, unnamed_in_words, why_without_a_name
 from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE, ODDS
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
@@ -69,7 +69,9 @@ def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
             something = "Something is" if diagnosis.certain else "Something may be"
             return f"{something} missing in the model: {named}. These views cannot tell which.{odds}"
         case "unknown_effect":
-            return f"Something is missing in the model, and no known effect explains it{_error_location(diagnosis)}."
+            return (
+                f"Something is missing in the model, and {why_without_a_name(diagnosis)}{_error_location(diagnosis)}."
+            )
     validation = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0]).cross_validation
     though = "" if diagnosis.likelier_than_not else ", though chance is more likely"
     missing = "Missing in the model" if diagnosis.certain else f"Perhaps missing in the model{though}"

@@ -405,7 +405,10 @@ class UsualEffects:
         of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
         for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
             errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)
-        for place, columns in self.by_place(thin_correspondences(unconstrained)).items():
+        by_place = self.by_place(thin_correspondences(unconstrained))
+        # A base that tilts follows the arm's pose as its joints do: one size for both.
+        arm = [by_place.pop(place) for place in ("robot", "base") if place in by_place]
+        for place, columns in (by_place | ({"robot": np.hstack(arm)} if arm else {})).items():
             errors = errors.with_component(place, columns @ columns.T, 1.0)
         return errors
 
@@ -433,9 +436,7 @@ class UsualEffects:
         responses = view_responses(self.measurement, self.model, terms, unconstrained)
         for term, response in zip(terms, responses, strict=True):
             usual = response.columns[:, ~term.gridded] * term.typical[~term.gridded]
-            # A base that tilts follows the arm's pose as its joints do: one size for both.
-            place = "robot" if term.effect.place == "base" else term.effect.place
-            columns.setdefault(place, []).append(usual)
+            columns.setdefault(term.effect.place, []).append(usual)
         return {place: np.hstack(blocks) for place, blocks in columns.items()}
 
 

@@ -61,6 +61,7 @@ def test_more_than_an_expected_scatter_is_said_with_what_is_expected():
         rotation=1e-4,
         translation=0.09,
         notes=(),
+        candidates=(),
         missing={},
         depends_on=(),
         implausible=False,

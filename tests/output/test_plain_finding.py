@@ -13,7 +13,7 @@ from stitch.api import stepwise
 from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
-from stitch.diagnosis.sentences import posterior_text
+from stitch.diagnosis.sentences import posterior_text, why_without_a_name
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
@@ -176,7 +176,12 @@ def _found(
     candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
     effects = ("play",) if verdict == "missing_effect" else ()
     candidates = (candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None))
-    more = {"depends_on": (SimpleNamespace(p_value=p_value),), "repeating_errors": (), "implausible": False}
+    more = {
+        "depends_on": (SimpleNamespace(p_value=p_value),),
+        "repeating_errors": (),
+        "implausible": False,
+        "notes": (),
+    }
     odds = np.log(3)
     return finding(verdict, *effects, candidates=candidates, certain=certain, log_odds_over_nothing=odds, **more)
 
@@ -195,7 +200,7 @@ def _found(
             "Not very sure: the odds that it is more than chance are 3 to 1",
         ),
         (_found("unknown_effect", 2e-4), "one of 5,000 sessions (p = 0.0002)."),
-        (_found("unknown_effect", 0.5), "the cause has no name"),
+        (_found("unknown_effect", 0.5), "No known effect explains it."),
         (_found("adequate", 0.4), "play comes nearest. Chance alone would show as much in 40% of such sessions"),
     ],
 )
@@ -348,3 +353,17 @@ def test_what_was_predicted_stands_beside_what_came(came, word):
     said = prediction_text(_changed(0.09, 0.04, came))
     assert said == f"Predicted on held-out views: 90 µm to 40 µm; it came to {came * 1e3:.0f} µm{word}"
     assert prediction_text(_changed(0.09, float("nan"), came)) == ""
+
+
+@pytest.mark.parametrize(
+    ("observable", "p", "said"),
+    [
+        (False, 1.0, "these views can test no known effect"),
+        (True, 0.006, "no known effect is clear enough to be named"),
+        (True, 0.4, "no known effect explains it"),
+    ],
+)
+def test_why_nothing_is_named_is_what_was_tested(observable, p, said):
+    ranked = SimpleNamespace(score=SimpleNamespace(observable=observable), adjusted=p, name="base_compliance")
+    diagnosis = SimpleNamespace(candidates=(SimpleNamespace(ranked=ranked),))
+    assert why_without_a_name(diagnosis) == said

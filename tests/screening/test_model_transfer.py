@@ -172,6 +172,7 @@ def ordinary_cell():
     known = np.linalg.inv(reduced.hand_eye.T @ np.linalg.solve(C, reduced.hand_eye))
     model = replace(model, covariance=known)
     usual = UsualEffects(measurement, model).by_place(thin_correspondences(views))
+    assert "base" in usual
     J = reduced.reduction @ np.hstack([columns for place, columns in usual.items() if place not in ("robot", "links")])
     return measurement, model, views, reduced.hand_eye, C, J
 

@@ -31,7 +31,7 @@ from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.numerics import frames
 from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from stitch.output.comparison.model_history import model_history
-from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
+from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline, run_light
 from stitch.output.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.cad_deviation import cad_sentence
@@ -170,6 +170,17 @@ def test_the_light_follows_the_tolerance(recorded):
     assert reaches[1] < reaches[0]
     tolerances = (1.01 * reaches[0], np.mean(reaches), 0.99 * reaches[1])
     assert [check_tolerance(history, t, "mm").light for t in tolerances] == ["good", "check", "bad"]
+
+
+def test_beside_a_doubt_nothing_is_within_a_tolerance(recorded):
+    """Views that hardly overlap agree to microns, and their cloud is off by as much as they slid."""
+    run, history = recorded[0], model_history(recorded[0])
+    wide = 1e3
+    assert run_light(replace(run, doubts=()), history, wide).light == "good"
+    found = run_light(
+        replace(run, doubts=("These three views overlap too little to say how well they agree.",)), history, wide
+    )
+    assert found.light == "check" and found.sentence.startswith("In doubt")
 
 
 def contrast(one, other):

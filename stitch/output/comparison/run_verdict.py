@@ -112,13 +112,20 @@ def _target_agreement(run: RunData) -> str:
 
 
 def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> ToleranceVerdict | None:
-    """Return whether 95 % of the part, or of the sightings of targets, agree within a tolerance (length_unit).
+    """Return whether 95 % of what several views see of the part, or of the targets, agree within a tolerance.
 
-    None where neither surfaces nor targets are seen by several views.
+    None where neither surfaces nor targets are seen by several views. Beside a doubt about the session the light is
+    "check" at best: views that are off together, or that hardly overlap, agree as well.
+
+    Args:
+        tolerance: length_unit.
     """
     unit = run.session.length_unit
     if history is not None:
-        return check_tolerance(history, tolerance, unit)
+        found = check_tolerance(history, tolerance, unit)
+        if not run.doubts or found.light == "bad":
+            return found
+        return ToleranceVerdict("check", f"In doubt, though views agree. {found.sentence}")
     if run.targets is None or run.targets.uninformative:
         return None
     reach = float(np.nanquantile(run.targets.distances, 0.95))
@@ -130,7 +137,7 @@ def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> T
 
 
 def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -> ToleranceVerdict:
-    """Return whether 95 % of the part agree within a tolerance (length_unit): "good", "check" or "bad".
+    """Return whether 95 % of what views share of the part agree within a tolerance: "good", "check" or "bad".
 
     good: under the model alone; check: only in the stitched cloud, with a correction of each view; bad: neither.
     """
@@ -138,7 +145,7 @@ def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -
     cloud = _reach(history.steps[-1])
     allowed = length_text(tolerance, length_unit, 4)
     part = (
-        f"95 % of the part agree to {length_text(model, length_unit)} under the model, "
+        f"95 % of what several views see of the part agree to {length_text(model, length_unit)} under the model, "
         f"{length_text(cloud, length_unit)} in the stitched cloud."
     )
     if cloud > tolerance:
@@ -150,5 +157,5 @@ def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -
 
 
 def _reach(step: ModelStep) -> float:
-    """Return the distance and expanded uncertainty that 95 % of the part stay below."""
+    """Return the distance and expanded uncertainty that 95 % of the part stay below, where several views see it."""
     return step.field.quantile() + _COVERAGE * float(np.nanmedian(step.field.sigma))

@@ -34,6 +34,8 @@ _MOST_POINTS = 20_000
 # Normals of points and of the feature may part by 45°; residuals beyond 4 robust sigmas are no part of it.
 _SAME_NORMAL, _OUTLYING = np.cos(np.radians(45.0)), 4.0
 _FEWEST = 12
+# Points that spread by more than this share of a diameter about a sphere, cylinder or circle are of other surfaces too.
+_LARGEST_FORM = 0.25
 # Of Gauss and Newton from a fit to the same points moved a little: each leaves a thousandth of what is missing.
 _STEPS = 3
 _Surface = Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -217,7 +219,7 @@ def fit_feature(feature: Feature, points: RunPoints, near: Indices) -> FittedFea
         near: (M,) indices of points within `reach_of` the feature.
 
     Raises:
-        NoResultError: too few points lie there.
+        NoResultError: too few points lie there, or they are of other surfaces too.
     """
     near = near[np.linspace(0, len(near) - 1, min(len(near), 4 * _MOST_POINTS)).astype(np.int64)]
     theta = nominal_parameters(feature)
@@ -231,6 +233,11 @@ def fit_feature(feature: Feature, points: RunPoints, near: Indices) -> FittedFea
         kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), _MOST_POINTS)).astype(np.int64)]
         fit = fit_points(feature, points.take(kept), theta)
         kept = kept[np.abs(fit.residual) <= _OUTLYING * mad_sigma(fit.residual)]
+    if feature.size and fit.form > _LARGEST_FORM * feature.size:
+        raise NoResultError(
+            f"{feature.name}: its points spread by {fit.form:.2g} about a {feature.kind} of {feature.size:g}; "
+            f"to fix: correct its place, or narrow `within` (now {feature.within:.2g}), so that no other surface counts"
+        )
     return fit
 
 

@@ -18,6 +18,7 @@ from data_synth.scanner import Scanner, scan_waves
 from data_synth.scene import load_scene
 from data_synth.shapes.spheres import SpherePlate, centres
 from stitch.api.pipeline import run
+from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.plugins.metrology import error_sources
 from stitch.plugins.metrology.budget import (
@@ -368,6 +369,13 @@ def test_points_far_from_the_nominal_surface_do_not_count():
     off[:40] += 0.6 * points.normals[:40]
     found = fit_feature(feature, RunPoints(off, points.normals, points.view, points.index), points.index)
     assert found.values[0] == pytest.approx(25.0, abs=0.01)
+
+
+def test_points_that_fill_the_space_about_a_ball_are_not_measured_as_one():
+    feature, points = _points("sphere")
+    spread = points.points + RNG.uniform(-6, 6, (_COUNT, 1)) * points.normals
+    with pytest.raises(NoResultError, match="its points spread by"):
+        fit_feature(replace(feature, within=8.0), replace(points, points=spread), points.index)
 
 
 def test_a_deviation_counts_from_the_mesh():
