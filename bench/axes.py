@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 import stitch
-from bench.harness import Parts, Row, Table, grouped, markdown, share
+from bench.harness import Parts, Row, Table, grouped, markdown, named_shares, share
 from data_synth.cells.axis_cell import AxisCell, axis_cell, write_cell
 from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
@@ -116,7 +116,7 @@ def named(job: Row) -> Row:
     """Return what a diagnosis names where a fault is hidden."""
     cell = axis_cell(job["kind"], job["seed"], {job["fault"]: job["amplitude"]})
     diagnosis = stitch.diagnose(_run(cell, _stated(cell, job["seed"], known=True)))
-    return {"verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+    return {"true": job["fault"], "verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
 
 
 def _by_ball(blade: AxisCell, seed: int) -> list[float]:
@@ -168,11 +168,8 @@ def _found_lines(rows: list[Row]) -> list[str]:
 
 
 def _named_lines(rows: list[Row]) -> list[str]:
-    table = []
-    for (kind, fault), of in grouped(rows, "kind", "fault").items():
-        groups = share(fault in row["effects"] and len(row["effects"]) > 1 for row in of)
-        wrong = share(bool(row["effects"]) and fault not in row["effects"] for row in of)
-        table.append((kind, f"`{fault}`", share(row["effects"] == [fault] for row in of), groups, wrong))
+    groups = grouped(rows, "kind", "fault").items()
+    table = [(kind, f"`{fault}`", *named_shares(of)) for (kind, fault), of in groups]
     return markdown("cell | hidden | named | in a group | wrong", table)
 
 

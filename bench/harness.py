@@ -142,6 +142,13 @@ def share(flags: Iterable[object]) -> str:
     return f"{sum(hits)}/{len(hits)} [{low:.2f}, {high:.2f}]"
 
 
+def named_shares(rows: Sequence[Row]) -> tuple[str, str, str]:
+    """Return how often rows name their `true` effect alone, among others, and others without it."""
+    right = share(row["effects"] == [row["true"]] for row in rows)
+    group = share(row["true"] in row["effects"] and len(row["effects"]) > 1 for row in rows)
+    return right, group, share(bool(row["effects"]) and row["true"] not in row["effects"] for row in rows)
+
+
 def markdown(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
     """Return a table whose heads stand in one text between bars; columns of numbers stand to the right."""
     cells = [[str(cell) for cell in row] for row in rows]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import stitch
-from bench.harness import Parts, Row, Table, grouped, markdown, share
+from bench.harness import Parts, Row, Table, grouped, markdown, named_shares, share
 from data_synth.cells.scanner_cell import KINDS, NAMES, ScannerCell, scanner_cell, write_scanners
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -73,26 +73,15 @@ def _found_lines(rows: list[Row]) -> list[str]:
         smaller = share(s["U"] < s["U_alone"] for s in every)
         adequate = share(row["verdict"] == "adequate" for row in of)
         wrong = share(bool(row["effects"]) for row in of)
-        numbers = (
-            f"{chi2:.2f} ({alone:.2f})",
-            f"{off:.0f} ({off_alone:.0f})",
-            f"{ratio:.2f}",
-            smaller,
-            adequate,
-            wrong,
-        )
-        table.append((kind, str(len(of)), *numbers))
+        against = (f"{chi2:.2f} ({alone:.2f})", f"{off:.0f} ({off_alone:.0f})", f"{ratio:.2f}")
+        table.append((kind, str(len(of)), *against, smaller, adequate, wrong))
     head = "cell | cells | χ²/6 (alone) | off at the part, µm (alone) | U over alone | smaller | adequate | wrong name"
     return markdown(head, table)
 
 
 def _named_lines(rows: list[Row]) -> list[str]:
-    table = []
-    for (kind, fault), of in grouped(rows, "kind", "fault").items():
-        right = share(row["effects"] == [row["true"]] for row in of)
-        group = share(row["true"] in row["effects"] and len(row["effects"]) > 1 for row in of)
-        wrong = share(bool(row["effects"]) and row["true"] not in row["effects"] for row in of)
-        table.append((kind, f"`{fault}`", str(len(of)), right, group, wrong))
+    groups = grouped(rows, "kind", "fault").items()
+    table = [(kind, f"`{fault}`", str(len(of)), *named_shares(of)) for (kind, fault), of in groups]
     return markdown("cell | hidden in one | cells | named for that one | in a group | wrong", table)
 
 

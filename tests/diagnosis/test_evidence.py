@@ -131,26 +131,20 @@ def test_an_error_that_two_effects_do_not_explain_stays_the_scanners(monkeypatch
 
 
 @pytest.mark.usefixtures("without_halves")
-@pytest.mark.parametrize("alone", [HELPS, USELESS])
-def test_a_second_effect_without_the_first_is_asked_alone(monkeypatch, alone):
+@pytest.mark.parametrize(
+    ("alone", "adjusted", "named"), [(HELPS, 1e-6, True), (USELESS, 1e-6, False), (HELPS, 0.2, False)]
+)
+def test_a_second_effect_without_the_first_is_asked_alone_and_by_chance_gets_no_name(
+    monkeypatch, alone, adjusted, named
+):
     first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
-    by_itself = ranked("fixture_drift")
+    by_itself = ranked("fixture_drift", adjusted=adjusted)
     said = {id(first.score): USELESS, id(second.score): HELPS, id(by_itself.score): alone}
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: said[id(score)])
     evidence = Evidence((ranked("backlash"), by_itself), (), alarm=True, explanation=(first,), further=second)
     found = upheld(monkeypatch, evidence, together=None, refused=[])
-    assert found.named == ((by_itself,) if alone is HELPS else ())
-    assert "backlash" in found.notes[0]
-
-
-@pytest.mark.usefixtures("without_halves")
-def test_a_second_effect_that_alone_may_be_chance_gets_no_name(monkeypatch):
-    first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
-    by_itself = ranked("fixture_drift", adjusted=0.2)
-    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: USELESS if score is first.score else HELPS)
-    evidence = Evidence((ranked("backlash"), by_itself), (), alarm=True, explanation=(first,), further=second)
-    found = upheld(monkeypatch, evidence, together=None, refused=[])
-    assert found.verdict == "unknown_effect" and not found.named
+    assert found.named == ((by_itself,) if named else ())
+    assert named or found.verdict == "unknown_effect"
     assert "backlash" in found.notes[0]
 
 

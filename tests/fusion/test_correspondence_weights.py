@@ -24,7 +24,7 @@ COUNT, VARIANCE = 400, 1e-4
 WITHOUT_STOCK = SimpleNamespace(scans=[SimpleNamespace(stock=None)] * 2)
 
 
-def faces(normals, offset, t=(0.0, 0.0, 0.0)):
+def faces(normals, offset, t):
     """View 0 less view 1 on planes of these normals: view 0 stands off by `offset`, and moved by `t`."""
     rng = np.random.default_rng(1)
     normal = np.repeat(np.asarray(normals, float), COUNT, axis=0)
@@ -36,14 +36,14 @@ def faces(normals, offset, t=(0.0, 0.0, 0.0)):
     return Match(0, 1, middle, normal, residual, weight=np.ones(len(residual)), index_v=index, index_w=index)
 
 
-def sums_of(match, moving=1e-1):
+def sums_of(match):
     """Normal equations (6, 6), (6,) of view 0, view 1 held, in units of a variance of 1e-4, and the sums of offsets.
 
     The prior leaves view 0 free to shift and hardly to turn.
     """
     weights = [np.ones(len(match.residual))]
     g = gram([match], 2, np.zeros(3), 0.01, weights)
-    prior = np.diag([1e12] * 3 + [moving] * 3)
+    prior = np.diag([1e12] * 3 + [1e-1] * 3)
     return g.matrix[0] / VARIANCE + prior, g.vector[0] / VARIANCE, OffsetSums(g, [match], weights, WITHOUT_STOCK)
 
 
@@ -53,15 +53,20 @@ def both(H, b):
     return np.block([[H, np.zeros((6, 6))], [np.zeros((6, 6)), held]]), np.append(b, np.zeros(6))
 
 
+def of_two_planes(a, t):
+    """Normal equations of view 0 on planes 90° apart without their common offset, its size, and their least square."""
+    H, b, sums = sums_of(faces([[1, 0, 0], [0, 1, 0]], a, t))
+    C, D, e = sums.coupling[0][:, :1] / VARIANCE, sums.matrix[:1, :1] / VARIANCE, sums.vector[:1] / VARIANCE
+    return *eliminate(H, b, C, D, e), sums.square[0]
+
+
 def test_two_planes_with_a_common_offset_have_the_closed_form_of_their_variance():
     """d₁ = a + n₁·t and d₂ = a + n₂·t of n planes have the variance ((n₁ − n₂)·t)²/4, least where that is nothing.
 
     Of planes 90° apart the fit takes back what of t lies along (1, −1)/√2; across it nothing moves, and the mean stays.
     """
     a, t = 0.3, np.array([0.07, -0.02, 0.0])
-    H, b, sums = sums_of(faces([[1, 0, 0], [0, 1, 0]], a, t))
-    C, D, e = sums.coupling[0][:, :1] / VARIANCE, sums.matrix[:1, :1] / VARIANCE, sums.vector[:1] / VARIANCE
-    H, b, size = eliminate(H, b, C, D, e)
+    H, b, size, _ = of_two_planes(a, t)
     along = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
     assert -np.linalg.solve(H, b)[3:] == pytest.approx(-(along @ t) * along, abs=1e-6)
     assert size == pytest.approx([a + (t[0] + t[1]) / 2], abs=1e-9)
@@ -71,10 +76,8 @@ def test_a_common_offset_costs_nothing():
     """Two planes: equations without the offset's share are the same for every offset, their least square too."""
     found = []
     for a in (0.0, 0.3, -5.0):
-        H, b, sums = sums_of(faces([[1, 0, 0], [0, 1, 0]], a, (0.07, -0.02, 0.0)))
-        C, D, e = sums.coupling[0][:, :1] / VARIANCE, sums.matrix[:1, :1] / VARIANCE, sums.vector[:1] / VARIANCE
-        H, b, _ = eliminate(H, b, C, D, e)
-        found.append((H, b, sums.square[0]))
+        H, b, _, square = of_two_planes(a, (0.07, -0.02, 0.0))
+        found.append((H, b, square))
     for H, b, square in found[1:]:
         assert pytest.approx(found[0][0]) == H
         assert pytest.approx(found[0][1], abs=1e-6) == b

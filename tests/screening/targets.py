@@ -1,12 +1,28 @@
 """Labelled points whose every place is known, as views from anywhere show them."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from data_synth.fixtures.in_memory import session_of
 from stitch.numerics import frames
 from stitch.session.capture import Sightings
+from stitch.session.session import Sighting
 
 VIEWS, SIGMA = 14, 0.01
 PLACES = np.array([[0, 0, 0], [120, 10, 0], [0, 90, 30], [80, 70, -20], [40, -60, 50.0]])
+
+
+def with_corners(measured, names=None):
+    """The session of a cell with clouds and four targets on its part, a to d, in some views by other names."""
+    corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
+    corners = frames.transform(measured.T_reference_scanner[0], measured.clouds[0].points.mean(axis=0) + corners)
+    session, rng, views = session_of(measured), np.random.default_rng(3), []
+    for v, T in enumerate(measured.T_reference_scanner):
+        seen = frames.transform(frames.inverse(T), corners) + 0.01 * rng.standard_normal(corners.shape)
+        called = tuple((names or {}).get(v, "abcd"))
+        views.append(replace(session.views[v], sighting=Sighting(called, seen, np.full(4, 0.01))))
+    return replace(session, views=tuple(views))
 
 
 def sightings(places, seed=0, unseen=()):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
-from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
 from stitch.numerics import frames
@@ -15,8 +14,7 @@ from stitch.screening.deep_check import deep_check
 from stitch.screening.moved_targets import find_moved_targets
 from stitch.screening.target_checks import target_warnings
 from stitch.session.capture import sightings_of
-from stitch.session.session import Sighting
-from tests.screening.targets import PLACES, SIGMA, VIEWS, sightings
+from tests.screening.targets import PLACES, SIGMA, VIEWS, sightings, with_corners
 
 MIXED_UP = 3
 ARM_VIEWS, MOVED_FROM = 16, 9
@@ -174,25 +172,13 @@ def test_right_names_of_many_targets_are_left_alone(count):
     assert find_mislabelled(many(count, False)[0]) == ()
 
 
-def with_corners(measured, order):
-    """The cell with four targets on the part, whose names in one view are in another order."""
-    corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
-    corners = frames.transform(measured.T_reference_scanner[0], measured.clouds[0].points.mean(axis=0) + corners)
-    session, rng, views = session_of(measured), np.random.default_rng(3), []
-    for v, T in enumerate(measured.T_reference_scanner):
-        seen = frames.transform(frames.inverse(T), corners) + 0.01 * rng.standard_normal(corners.shape)
-        names = ("a", "b", "c", "d") if v != MIXED_UP else tuple("abcd"[k] for k in order)
-        views.append(replace(session.views[v], sighting=Sighting(names, seen, np.full(4, 0.01))))
-    return replace(session, views=tuple(views))
-
-
 def test_beside_clouds_the_names_are_blamed_and_not_the_scan():
     """The labels held the scan in a wrong place, and another view was named."""
     measured = measured_blade(21, views=8, pixels=60)
-    found = run(with_corners(measured, (1, 2, 3, 0)))
+    found = run(with_corners(measured, {MIXED_UP: "bcda"}))
     assert found.left_out == () and "targets of view v003 bear each other's names" in found.doubts[0]
     assert [(o.view, o.target) for o in found.outliers] == [(MIXED_UP, None)]
-    clean = run(with_corners(measured, (0, 1, 2, 3)))
+    clean = run(with_corners(measured))
     assert clean.doubts == () and clean.outliers == ()
     off = [np.linalg.norm(frames.log(frames.inverse(measured.T_mount) @ own.T_mount)[3:]) for own in (found, clean)]
     assert off[0] < 2 * off[1] + 0.02

@@ -17,7 +17,8 @@ from stitch.output.result_document import result_document
 from stitch.screening.view_screening import ViewScreening, fit_screened_views
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
-from stitch.session.session import Cloud, Sighting
+from stitch.session.session import Cloud
+from tests.screening.targets import with_corners
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +32,13 @@ def with_view(session, number, **changes):
     return replace(session, views=tuple(views))
 
 
+def torn(session, number, by):
+    """The session with half of one scan so many mm off."""
+    points = session.views[number].cloud.points
+    half = points[:, 0] > np.median(points[:, 0])
+    return with_view(session, number, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, by])))
+
+
 def test_a_good_session_leaves_nothing_out(good):
     found = run(good)
     assert found.left_out == () and found.links.components == (tuple(v.name for v in good.views),)
@@ -39,27 +47,16 @@ def test_a_good_session_leaves_nothing_out(good):
 
 def test_a_scan_that_is_torn_in_itself_is_named_and_left_out(good):
     """Half of it 1 mm off: that half has no partners, and the other fits; it used to be fused beside the others."""
-    points = good.views[4].cloud.points
-    half = points[:, 0] > np.median(points[:, 0])
-    found = run(with_view(good, 4, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, 1.0]))))
+    found = run(torn(good, 4, 1.0))
     assert [item.view for item in found.left_out] == ["v004"]
     assert "contradicts the other scans wherever it is put" in found.left_out[0].why
 
 
 def test_a_torn_scan_is_named_though_common_targets_hold_it():
     """They say where it was taken from, and one half lies there: nothing of it is displaced as a whole."""
-    measured = measured_blade(21, views=6, pixels=80)
-    corners = np.array([[0.0, 0, 0], [40, 0, 0], [0, 40, 0], [0, 0, 40]])
-    corners = frames.transform(measured.T_reference_scanner[0], measured.clouds[0].points.mean(axis=0) + corners)
-    session, rng = session_of(measured), np.random.default_rng(3)
-    for v, T in enumerate(measured.T_reference_scanner):
-        seen = frames.transform(frames.inverse(T), corners) + 0.01 * rng.standard_normal(corners.shape)
-        session = with_view(session, v, sighting=Sighting(("a", "b", "c", "d"), seen, np.full(4, 0.01)))
+    session = with_corners(measured_blade(21, views=6, pixels=80))
     assert run(session).left_out == ()
-    points = session.views[4].cloud.points
-    half = points[:, 0] > np.median(points[:, 0])
-    torn = with_view(session, 4, cloud=Cloud(points + half[:, None] * np.array([0.0, 0.0, 2.0])))
-    (gone,) = run(torn).left_out
+    (gone,) = run(torn(session, 4, 2.0)).left_out
     assert gone.view == "v004" and "contradicts the other scans" in gone.why
 
 

@@ -76,12 +76,18 @@ def test_steps_are_named_and_every_one_helps(changed):
     assert sorted(means, reverse=True) == means
 
 
-def test_the_standard_error_of_a_patch_is_its_scatter_about_the_truth():
-    """With true poses all that is left is noise: values in units of their standard errors are normal."""
+def still_blade():
+    """True poses of a blade's views by an arm that does not scatter, their points, and what overlaps there."""
     measured, capture = captured_blade(1, views=6, pixels=90, repeatability=(0.0, 0.0))
     T = measured.T_reference_scanner
     overlaps = collect_overlaps(capture, T, 1.5, [sample_points(scan, 3000) for scan in capture.scans])
-    e = signed_distances(overlaps.matches, T, [scan.points for scan in capture.scans])
+    return T, [scan.points for scan in capture.scans], overlaps
+
+
+def test_the_standard_error_of_a_patch_is_its_scatter_about_the_truth():
+    """With true poses all that is left is noise: values in units of their standard errors are normal."""
+    T, points, overlaps = still_blade()
+    e = signed_distances(overlaps.matches, T, points)
     field = patches_of(overlaps.matches, len(T), overlaps.gram.scale, model_distances=e).field(e)
     z = (field.values / field.sigma)[np.isfinite(field.values)]
     # A standard error from a few cells is good to a factor; the median |z| of a normal variable is 0.6745.
@@ -90,9 +96,7 @@ def test_the_standard_error_of_a_patch_is_its_scatter_about_the_truth():
 
 
 def test_a_view_that_is_moved_lies_off_by_its_motion():
-    measured, capture = captured_blade(1, views=6, pixels=90, repeatability=(0.0, 0.0))
-    T, points = measured.T_reference_scanner, [scan.points for scan in capture.scans]
-    overlaps = collect_overlaps(capture, T, 1.5, [sample_points(scan, 3000) for scan in capture.scans])
+    T, points, overlaps = still_blade()
     shift = np.array([0.11, -0.07, 0.05])
     moved = T.copy()
     moved[2, :3, 3] += shift

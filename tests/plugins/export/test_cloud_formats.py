@@ -105,12 +105,17 @@ def test_glb_by_its_specification(cloud):
     assert coloured(own["COLOR_0"][:, :3])
 
 
-def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
-    export, metres = cloud
+def write_mesh(file):
+    """A triangle between three of the points."""
     vertices = np.array([tuple(POINTS[i]) for i in (0, 279, 299)], [(a, "<f8") for a in "xyz"])
     faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
     elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements).write(str(tmp_path / "r" / "mesh.ply"))
+    PlyData(elements).write(str(file))
+
+
+def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
+    export, metres = cloud
+    write_mesh(tmp_path / "r" / "mesh.ply")
     own, indices, mode = gltf(export("glb"))
     assert mode == 4 and indices.ravel().tolist() == [0, 1, 2]  # triangles
     assert np.allclose(own["POSITION"], POINTS[[0, 279, 299]] * metres, rtol=1e-6)
@@ -122,10 +127,7 @@ def test_cloud_and_mesh_lie_in_the_frame_of_the_datum(cloud, tmp_path, kind):
     export, metres = cloud
     T = np.array([[0, -1, 0, 5.0], [1, 0, 0, -7.0], [0, 0, 1, 2.0], [0, 0, 0, 1]])
     (tmp_path / "r" / "features.json").write_text(json.dumps({"T_datum_reference": T.tolist()}))
-    vertices = np.array([tuple(POINTS[i]) for i in (0, 279, 299)], [(a, "<f8") for a in "xyz"])
-    faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
-    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements).write(str(tmp_path / "r" / "mesh.ply"))
+    write_mesh(tmp_path / "r" / "mesh.ply")
     there = POINTS @ T[:3, :3].T + T[:3, 3]
     if kind == "ply":
         vertex = PlyData.read(export("ply", "--datum"))["vertex"]

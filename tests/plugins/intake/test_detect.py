@@ -43,14 +43,17 @@ CHARUCO = "charuco:8x6:12:9:DICT_4X4_50"
 INNER = np.array([[c * 12.0, r * 12.0] for r in range(1, 6) for c in range(1, 8)])
 
 
+def charuco_print():
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    return board_print(cv2.aruco.CharucoBoard((8, 6), 12.0, 9.0, dictionary), 8, 6, 12.0)
+
+
 @pytest.fixture(scope="module")
 def cell():
     """Scans of a board from three poses, and the poses of the flange."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    print_ = board_print(cv2.aruco.CharucoBoard((8, 6), 12.0, 9.0, dictionary), 8, 6, 12.0)
-    inner = np.array([[c * 12.0, r * 12.0] for r in range(1, 6) for c in range(1, 8)])
+    print_ = charuco_print()
     poses = poses_before(200, 3, np.array([48.0, 36.0]), tilt=0.5)
-    scans = [scan_print(print_, T, inner, seed=i) for i, T in enumerate(poses)]
+    scans = [scan_print(print_, T, INNER, seed=i) for i, T in enumerate(poses)]
     return scans, T_BASE_BOARD @ frames.inverse(poses) @ frames.inverse(T_FLANGE_SCANNER)
 
 
@@ -120,15 +123,13 @@ def test_clouds_without_pixels_are_refused(session):
 @pytest.mark.slow
 def test_a_flat_board_tells_how_poses_are_to_be_read(cell, tmp_path):
     """A plane slides on itself under any reading; its corners do not."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    print_ = board_print(cv2.aruco.CharucoBoard((8, 6), 12.0, 9.0, dictionary), 8, 6, 12.0)
-    inner = np.array([[c * 12.0, r * 12.0] for r in range(1, 6) for c in range(1, 8)])
+    print_ = charuco_print()
     poses = poses_before(200, 6, np.array([48.0, 36.0]), seed=4, tilt=0.5)
     raw = tmp_path / "raw"
     raw.mkdir()
     small = Camera(240, 180, 300.0)
     for i, T in enumerate(poses):
-        write_pcd(raw / f"scan{i}.pcd", scan_print(print_, T, inner, seed=i, camera=small))
+        write_pcd(raw / f"scan{i}.pcd", scan_print(print_, T, INNER, seed=i, camera=small))
     T_base_flange = T_BASE_BOARD @ frames.inverse(poses) @ frames.inverse(T_FLANGE_SCANNER)
     angles = Rotation.from_matrix(T_base_flange[:, :3, :3]).as_euler("ZYX", degrees=True)
     rows = np.hstack([T_base_flange[:, :3, 3], angles])

@@ -189,16 +189,21 @@ def test_what_smooth_errors_make_of_the_overlaps_is_not_called_noise(cell):
     assert beside < 5 * before < alone
 
 
+BALL = Feature("ball", "sphere", at=np.array([0.0, 0.0, 500.0]), size=40.0)
+
+
+def _lower_normals(directions):
+    """Unit normals of the lower side of a ball."""
+    normal = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return normal[normal[:, 2] < -0.5]
+
+
 def test_a_shell_and_ways_along_the_rays_are_all_that_incidence_does_to_a_ball():
-    ball = Feature("ball", "sphere", at=np.array([0.0, 0.0, 500.0]), size=40.0)
-    rng = np.random.default_rng(0)
-    normal = rng.standard_normal((4000, 3)) - [0.0, 0.0, 2.0]
-    normal = (normal.T / np.linalg.norm(normal, axis=1)).T
-    normal = normal[normal[:, 2] < -0.5]
-    points, ray = ball.at + 20.0 * normal, np.array([0.0, 0.0, 1.0])  # of a scanner far away
+    normal = _lower_normals(np.random.default_rng(0).standard_normal((4000, 3)) - [0.0, 0.0, 2.0])
+    points, ray = BALL.at + 20.0 * normal, np.array([0.0, 0.0, 1.0])  # of a scanner far away
     shift = 0.01 * (1 / -normal[:, 2] - 1)
     at = RunPoints(points + shift[:, None] * ray, normal, *np.zeros((2, len(points)), np.int64))
-    fit = fit_points(ball, at, np.array([0.0, 0.0, 0.0, 20.0]))
+    fit = fit_points(BALL, at, np.array([0.0, 0.0, 0.0, 20.0]))
     # But for the square of the shift over the ball's size.
     assert fit.values[0] - 40.0 == pytest.approx(-0.02, rel=3e-3)
     assert fit.values[3] - 500.0 == pytest.approx(-0.01, rel=3e-3)
@@ -206,16 +211,13 @@ def test_a_shell_and_ways_along_the_rays_are_all_that_incidence_does_to_a_ball()
 
 
 def test_noise_along_the_rays_moves_a_ball_as_its_own_residuals_say():
-    ball = Feature("ball", "sphere", at=np.array([0.0, 0.0, 500.0]), size=40.0)
     rng = np.random.default_rng(1)
-    normal = rng.standard_normal((3000, 3))
-    normal = (normal.T / np.linalg.norm(normal, axis=1)).T
-    normal = normal[normal[:, 2] < -0.5]
+    normal = _lower_normals(rng.standard_normal((3000, 3)))
     fits = []
     for noise in 0.02 * rng.standard_normal((300, len(normal))):  # of a scanner far away, along z
-        points = ball.at + 20.0 * normal + np.outer(noise, [0.0, 0.0, 1.0])
+        points = BALL.at + 20.0 * normal + np.outer(noise, [0.0, 0.0, 1.0])
         at = RunPoints(points, normal, *np.zeros((2, len(points)), np.int64))
-        fits.append(fit_points(ball, at, np.array([0.0, 0.0, 0.0, 20.0])))
+        fits.append(fit_points(BALL, at, np.array([0.0, 0.0, 0.0, 20.0])))
     by_residuals = np.mean([np.sum((fit.slopes * fit.noise) ** 2, axis=1) for fit in fits], axis=0)
     spread = np.var([fit.values for fit in fits], axis=0)
     # Of 300 draws a standard deviation is known to 4 %; the same noise across the whole surface would make 1.6 times it.

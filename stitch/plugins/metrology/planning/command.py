@@ -141,8 +141,6 @@ def _drive_cell(
     """Take views by a command until U is reached; print each, and what to do next."""
     import shlex
 
-    import numpy as np
-
     from stitch.numerics.units import length_text
     from stitch.output.json_file import to_json
     from stitch.plugins.metrology.planning.drive import DrivenCell, drive
@@ -155,9 +153,7 @@ def _drive_cell(
             f"--drive: {odd[0] if odd else folder} is not for it; to fix: a session's folder, without {odd}"
         )
     part, size, field, start = stated
-    joints = None if start is None else np.radians(_option_numbers("--start", start, "joint angles (°)"))
-    if joints is None and not (folder / "views.csv").is_file():
-        raise InputError(f"{folder}: no view yet; to fix: --start J1,J2,… in degrees, where the scanner sees the part")
+    joints = _start_joints(folder, start)
     unit = load_session(folder, scans=False, start=joints).length_unit
     taken: list[tuple[int, float | None]] = []
 
@@ -241,23 +237,31 @@ def _cell_of_session(
     folder: Path, part: Path | None, size: float | None, field: float | None, start: str | None
 ) -> tuple[SessionData, PlannedCell]:
     """Return the cell of a session, of which options may say what the session does not."""
-    import numpy as np
-
     from stitch.plugins.metrology.planning.expected_model import cell_of_session
     from stitch.session.axis_poses import require_placed
     from stitch.session.reading.session_folder import load_session
 
-    joints = None
+    session = load_session(folder, scans=False, start=_start_joints(folder, start))
+    require_placed(session)
+    return session, cell_of_session(session, part, size, field)
+
+
+def _start_joints(folder: Path, start: str | None) -> Array | None:
+    """Return the joint angles (n,) that --start states, rad; None where views are planned already.
+
+    Raises:
+        InputError: no numbers, or a session without either.
+    """
+    import numpy as np
+
     if start is not None:
-        joints = np.radians(_option_numbers("--start", start, "joint angles (°), as 0,-90,90,0,45,0"))
-    elif (folder / "session.toml").is_file() and not (folder / "views.csv").exists():
+        return np.radians(_option_numbers("--start", start, "joint angles (°), as 0,-90,90,0,45,0"))
+    if (folder / "session.toml").is_file() and not (folder / "views.csv").exists():
         raise InputError(
             f"{folder}: no views.csv; to fix: write planned joints or poses there, or give --start J1,J2,… in degrees, "
             "where the scanner sees the part"
         )
-    session = load_session(folder, scans=False, start=joints)
-    require_placed(session)
-    return session, cell_of_session(session, part, size, field)
+    return None
 
 
 def _option_numbers(option: str, text: str, what: str, counts: tuple[int, ...] = ()) -> Array:

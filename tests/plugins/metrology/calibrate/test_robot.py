@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data_synth.arms import ARMS
-from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
+from data_synth.fixtures.labelled_arm import DH_ROWS, flange, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
@@ -243,23 +243,12 @@ def arm_with(*names):
     return ArmModel("cell", ROBOT, tuple(terms), "mm", JOINTS), told
 
 
-def product(rows, joints):
-    """Standard DH, multiplied out."""
-    T = np.eye(4)
-    for row, q in zip(rows, joints, strict=True):
-        angle, alpha = q + np.radians(row["theta_deg"]), np.radians(row["alpha_deg"])
-        c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
-        a, d = row["a"], row["d"]
-        T = T @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
-    return T
-
-
 @pytest.mark.parametrize("name", ["joint_offset", "link_geometry"])
 def test_rows_put_the_flange_where_nature_does(name):
     arm, told = arm_with(name)
     rows = tomllib.loads(ARM_FORMATS["arm-dh"](arm))["robot"]["joints"]
     nature = true_flanges(name, told[name], ARM, JOINTS)
-    assert np.array([product(rows, q) for q in JOINTS]) == pytest.approx(nature, abs=1e-9)
+    assert np.array([flange(q, rows=rows) for q in JOINTS]) == pytest.approx(nature, abs=1e-9)
 
 
 def test_urdf_puts_the_flange_where_nature_does(tmp_path):

@@ -80,14 +80,19 @@ ROTATION, TRANSLATION = 5e-5, 0.03
 DRAWS = 40
 
 
+def cell_seeing(measured, near, far):
+    """A blade's cell by a scanner that sees between two distances, in standoffs."""
+    reach = measured.scene.scanner.standoff
+    field = FieldOfView(np.array([0.3, 0.3]), near * reach, far * reach, standoff=reach, axis=np.array([0.0, 0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
+    return CellModel(Model(measured.T_mount), part, field, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+
+
 @pytest.fixture(scope="module", params=["eye_to_hand", "eye_in_hand"])
 def planned(request):
     """What a blade's cell measured, and its views as planned, with a scanner that has next to no noise."""
     measured = measured_blade(3, views=7, mount=request.param, pixels=8)
-    reach = measured.scene.scanner.standoff
-    field = FieldOfView(np.array([0.3, 0.3]), 0.6 * reach, 1.4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
-    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
-    cell = CellModel(Model(measured.T_mount), part, field, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    cell = cell_seeing(measured, 0.6, 1.4)
     found = simulate_views(session_of(measured), cell)
     return measured, found, expected_model(found, cell)
 
@@ -148,11 +153,6 @@ def test_chances_of_nothing_and_of_what_nobody_can_miss(planned):
 
 
 def test_views_that_see_nothing_are_refused(planned):
-    measured, _, linear = planned
-    session = session_of(measured)
-    reach = measured.scene.scanner.standoff
-    blind = FieldOfView(np.array([0.3, 0.3]), 3 * reach, 4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
-    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
-    cell = CellModel(Model(measured.T_mount), part, blind, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    measured, *_ = planned
     with pytest.raises(NoResultError, match=r"view v000 would see next to nothing"):
-        simulate_views(replace(session, name="blind"), cell)
+        simulate_views(replace(session_of(measured), name="blind"), cell_seeing(measured, 3.0, 4.0))
