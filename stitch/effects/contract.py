@@ -288,18 +288,24 @@ class Effect:
             moments: names of the moments that tilt its base.
             scanners: names of all scanners; () of a single one.
         """
+        # What follows the argument in the names of its parameters, by its kind.
+        endings: dict[str, Sequence[str]] = {
+            "number": [""],
+            "joint": [str(i + 1) for i in range(joints)],
+            "torque": torques,
+            "moment": moments,
+        }
         # The first scanner's place is the hand-eye: it has no parameters.
-        things = {kind: [axis.name for axis in axes if axis.kind == kind] for kind in KINDS} | {"scanner": scanners[1:]}
-        named = [
-            (key, spec, name)
-            for key, spec in self.specs.items()
-            for name in (
-                [f"{key}{part}_{thing}" for thing in things[spec.kind] for part in spec.axes]
-                if spec.kind in things
-                else _parameter_names(key, spec, joints, moments if spec.kind == "moment" else torques)
-            )
-        ]
-        return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
+        owners = {kind: [axis.name for axis in axes if axis.kind == kind] for kind in KINDS} | {"scanner": scanners[1:]}
+        parameters = list[Parameter]()
+        for key, spec in self.specs.items():
+            names = [key + ending for ending in endings.get(spec.kind, spec.axes)]
+            if spec.kind == "twist":
+                names = [*TWIST]
+            elif spec.kind in owners:
+                names = [f"{name}_{owner}" for owner in owners[spec.kind] for name in names]
+            parameters += [_parameter(key, spec, name, length_unit) for name in names]
+        return tuple(parameters)
 
     def arguments(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Return the keyword arguments of the effect's function, from all of its parameters in their order.
@@ -311,28 +317,6 @@ class Effect:
             values[p.argument].append(p.value)
         single = {key for key, spec in self.specs.items() if spec.kind == "number"}
         return {key: float(given[0]) if key in single else np.array(given, float) for key, given in values.items()}
-
-
-def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
-    """Return the names of the parameters that an argument stands for; not of axes and scanners, which have names.
-
-    Args:
-        key: the argument.
-        spec: of the argument.
-        joints: number of joints.
-        torques: names of torques, or of moments where the spec is of that kind.
-    """
-    match spec.kind:
-        case "number":
-            return [key]
-        case "vector" | "offset":
-            return [key + axis for axis in spec.axes]
-        case "joint":
-            return [f"{key}{i + 1}" for i in range(joints)]
-        case "torque" | "moment":
-            return [f"{key}{name}" for name in torques]
-        case _:
-            return TWIST
 
 
 def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
@@ -522,20 +506,14 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     return tuple(missing)
 
 
-def stands_still(measurement: Measurement, effect: Effect) -> bool:
-    """Return True if an effect needs gravity to turn for the one of scanner and part that stands still in this session.
-
-    That is the scanner with eye_to_hand, the part with eye_in_hand: gravity cannot turn for what stands still.
-    """
-    return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
-
-
 def is_asked(measurement: Measurement, effect: Effect) -> bool:
     """Return True if an effect is a candidate here, or one that is listed with what it lacks.
 
-    Not those of tier geometry, of what stands still (`stands_still`), and of axes in a session without any.
+    Not those of tier geometry, of axes in a session without any, and of gravity where it cannot turn: at what stands
+    still, the scanner with eye_to_hand, the part with eye_in_hand.
     """
-    if effect.tier == "geometry" or stands_still(measurement, effect):
+    gravity_of_still = "gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part"
+    if effect.tier == "geometry" or gravity_of_still in effect.needs:
         return False
     return effect.place != "axis" or bool(measurement.views.axes)
 

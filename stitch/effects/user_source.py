@@ -22,7 +22,7 @@ from stitch.effects.contract import EFFECTS, Effect
 from stitch.errors import InputError
 
 # What a run folder calls the file.
-FILE = "model_effects.py"
+EFFECTS_FILE = "model_effects.py"
 _HEADER = '"""Effects of a run, as the program defined them that ran it."""\n'
 _FIX = "to fix: write the effect into a file, and load it with stitch.effects.user_file.load"
 
@@ -154,7 +154,7 @@ def _require_same(text: str, effects: Sequence[Effect]) -> None:
     """
     before = dict(EFFECTS)
     try:
-        exec(compile(text, FILE, "exec"), {"__name__": "stitch_user_effects"})
+        exec(compile(text, EFFECTS_FILE, "exec"), {"__name__": "stitch_user_effects"})
         fresh = [EFFECTS.get(e.name) for e in effects]
         wrong = [e.name for e, f in zip(effects, fresh, strict=True) if f is None or f is e or f.specs != e.specs]
     except Exception as error:

@@ -116,11 +116,13 @@ class CoarseHandEye:
 def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
     """Return a known hand-eye as the start of the correction, with the widest gate: `COARSE_GATE` of the part's size.
 
+    It was not searched: there are no candidates.
+
     Args:
         T_mount: (4, 4) maps scanner to mount.
         source: where it comes from, in words.
     """
-    return CoarseHandEye(T_mount, COARSE_GATE * part_size(captures), source, ())
+    return CoarseHandEye(T_mount, gate=COARSE_GATE * part_size(captures), source=source, candidates=())
 
 
 def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:

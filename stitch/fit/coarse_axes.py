@@ -48,9 +48,10 @@ def locate_axes(
         NoResultError: the scans do not say where.
     """
     axes = axes_of(sessions[0])
-    if axes.are_placed:
+    unplaced = [axis.name for axis in axes.axes if not axis.is_placed]
+    if not unplaced:
         return list(sessions), list(measurements)
-    unknown = " and ".join(axis.name for axis in axes.axes if not axis.is_placed)
+    unknown = " and ".join(unplaced)
     fix = f"to fix: state direction (and point) of {unknown} in [[axis]], to some millimetres and milliradians"
     if not sessions[0].has_clouds:
         raise InputError(f"{sessions[0].path}: labelled points do not say where axis {unknown} stands; {fix}")

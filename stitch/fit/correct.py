@@ -15,7 +15,7 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.model.model import Model
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import least_squares
 from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
@@ -27,7 +27,6 @@ from stitch.observations.surfaces.hand_eye_fit import (
     hand_eye_jacobian,
     solve_hand_eye,
 )
-from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import (
     FINE_SAMPLES,
     Overlaps,
@@ -143,7 +142,7 @@ def correct(
 
     announce("correct: what the corrected hand-eye leaves")
     final = tuple(
-        collect_overlaps(c, c.poses(solved.T_mount), gate, _fine_samples(c), f.overlaps)
+        collect_overlaps(c, c.poses(solved.T_mount), gate, before=f.overlaps)
         for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
     return Correction(
@@ -306,7 +305,7 @@ def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlap
         NoResultError: no two views overlap.
     """
     gate = converged_gate(capture, T_mount, gate)
-    return collect_overlaps(capture, capture.poses(T_mount), gate, _fine_samples(capture))
+    return collect_overlaps(capture, capture.poses(T_mount), gate)
 
 
 def gate_of_model(capture: Capture, T_mount: Array) -> float:
@@ -347,8 +346,3 @@ def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
         if settled:
             break
     return gate
-
-
-def _fine_samples(capture: Capture) -> list[Indices]:
-    """Return per view the numbers of its points that are searched for the final normal equations."""
-    return [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]

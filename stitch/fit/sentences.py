@@ -130,13 +130,6 @@ def _scatter_sentences(scatter: Repeatability, registered: float, length_unit: s
     )
 
 
-def correct_note(before: float, after: float) -> str:
-    """Return why the correction left a larger rms than it found; empty where it did not."""
-    if after > before:
-        return "the robot's poses are noisy, so the fit trusts the average of all views rather than each overlap"
-    return ""
-
-
 def coarse_note(start: CoarseHandEye) -> str:
     """Return the note of the coarse stage: where the hand-eye comes from and, if searched, how clear the answer is."""
     # A hand-eye that was given has no candidates.

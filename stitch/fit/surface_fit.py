@@ -33,9 +33,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
     fit_hand_eye,
     whiten_captures,
 )
-from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import (
-    FINE_SAMPLES,
     Overlaps,
     collect_overlaps,
     next_gate,
@@ -83,7 +81,10 @@ def fit_surfaces(
 
     def linearise(before: "SurfaceStep | None") -> LinearisedSurfaces:
         """Return the problem about the first model, or about the one after a step."""
-        return linearise_surfaces(measurements, model if before is None else before.model, gates)
+        about = model if before is None else before.model
+        captures, unconstrained = _free_views(measurements, about, gates)
+        columns = [view_columns(m, about, f) for m, f in zip(measurements, unconstrained, strict=True)]
+        return LinearisedSurfaces(measurements, about, captures, unconstrained, columns)
 
     history: list[float] = []
     for step in iterate(linearise, at_most=_MAXIMUM_STEPS, converged=_CONVERGED):
@@ -121,7 +122,7 @@ def fit_surfaces(
 
 @dataclass(frozen=True)
 class LinearisedSurfaces:
-    """Free-network poses of all sessions about a model; P parameters of effects."""
+    """The fit's problem about a model: views of all sessions moved by their overlaps alone; P parameters of effects."""
 
     measurements: Sequence[Measurement]
     model: Model
@@ -236,17 +237,6 @@ class LinearisedSurfaces:
 SurfaceStep = Step[LinearisedSurfaces, HandEyeFit]
 
 
-def linearise_surfaces(measurements: Sequence[Measurement], model: Model, gates: Sequence[float]) -> LinearisedSurfaces:
-    """Return the fit's problem about a model: views moved by their overlaps alone, and twists per effect's parameter.
-
-    Args:
-        gates: per session the largest distance between corresponding points at first, length_unit.
-    """
-    captures, unconstrained = _free_views(measurements, model, gates)
-    columns = [view_columns(m, model, f) for m, f in zip(measurements, unconstrained, strict=True)]
-    return LinearisedSurfaces(measurements, model, captures, unconstrained, columns)
-
-
 def _free_views(
     measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
 ) -> tuple[tuple[Capture, ...], list[UnconstrainedPoses]]:
@@ -283,7 +273,6 @@ def _final_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
         T_mount: (4, 4) maps scanner to mount.
         gate: largest distance between corresponding points the first time, length_unit.
     """
-    samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     poses = capture.poses(T_mount)
-    overlaps = collect_overlaps(capture, poses, gate, samples)
-    return collect_overlaps(capture, poses, min(gate, next_gate(overlaps, capture)), samples, overlaps)
+    overlaps = collect_overlaps(capture, poses, gate)
+    return collect_overlaps(capture, poses, min(gate, next_gate(overlaps, capture)), before=overlaps)

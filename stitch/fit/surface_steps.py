@@ -9,7 +9,7 @@ import numpy as np
 from stitch.fit.coarse import ALONE, REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.fit.correct import Correction, apply_given_hand_eye, correct
 from stitch.fit.fit import FitStart, FittedRig, fit_without_outliers
-from stitch.fit.sentences import correct_note, mixed_notes, register_note, support_note, surface_sentence, warnings
+from stitch.fit.sentences import mixed_notes, register_note, support_note, surface_sentence, warnings
 from stitch.fit.surface_fit import fit_surfaces
 from stitch.fit.target_fit import locate_targets
 from stitch.fusion.fuse import RegisteredSession, fuse_every_point, has_whole_clouds
@@ -170,7 +170,9 @@ def register_session(
     assert correction is not None
     model, capture, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
     poses_model = capture.poses(model.T_mount)
-    note = "" if correction.given else correct_note(coarse.rms, overlaps.gram.rms)
+    note = ""
+    if overlaps.gram.rms > coarse.rms and not correction.given:
+        note = "the robot's poses are noisy, so the fit trusts the average of all views rather than each overlap"
     corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
     registration, registered = _register_views(session, correction, index, recorder, method)

@@ -299,8 +299,8 @@ class LinearisedTargets:
 TargetStep = Step[LinearisedTargets, TargetSolution]
 
 
-def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit | None:
-    """Return the labelled points of a session under a model that was fitted to clouds; None where it has none.
+def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit:
+    """Return the labelled points of a session, which has some, under a model that was fitted to clouds.
 
     Their places are fitted by least squares, nothing else is. The covariance counts the scatter of the poses, the
     sensor's noise and the hand-eye; no held-out distances are computed (NaN).
@@ -308,8 +308,6 @@ def locate_targets(measurement: Measurement, model: Model, inflation: float) -> 
     Args:
         inflation: of the hand-eye's covariance, only passed on.
     """
-    if measurement.capture.sightings is None:
-        return None
     capture = corrected_capture(measurement, model)
     landmarks, blocks, variances = fit_landmarks(capture, model.T_mount)
     rows = target_rows(capture, model.T_mount, landmarks)

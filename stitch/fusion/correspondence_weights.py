@@ -1,22 +1,24 @@
-"""Weighted variance of signed distances in two sign classes: the DPWVM-style fit of `register`.
+"""Weights of the correspondences in `register`, by method, and offsets of whole surfaces that cost nothing there.
 
-The patent whose last step it is (source A: blade stitching by hand-eye correction) names DPWVM without a formula. What
-is built here follows its published relatives and says of each part what is source and what is choice:
+A correspondence has a signed distance d along the normal, positive where the first view's point lies outside.
 
-- *Objective*, source: variance-minimisation matching. With d the signed distances of two views, mean(d²) = Var(d) +
-  mean(d)²; only Var(d) is made small, so that an offset common to all points of a view costs nothing. Choice: it costs
-  nothing for a view that shows one (`shared_offsets`), and counts in full for all others. There an offset is the step
-  that stitching has to close; set free for every view it would leave a third more error (docs/register.md).
-- *Classes*, source: weighted plus-and-minus allowance variance minimisation. Distances above and below the middle are
-  a plus and a minus class, each with a scale. Choice: the middle is the weighted median, so that both classes hold the
-  same weight and exchange their places with the views; the cleaner class gives both their scale.
-- *Weights*, `dpwvm_weights`: distance, sign class, density and incidence, found anew at every iteration.
+`dpwvm`: the weighted variance of the distances is made small, in two classes by their sign. A patent on stitching
+blades by hand-eye correction calls its last step DPWVM and gives no formula. Two published methods are its relatives;
+what follows them, and where it departs from them, is this:
 
-Two methods stand beside it. `vmm_weights` is the family as it is published: a class has its own mean, its distances
-weigh by how near they lie to it, and the sum of both variances is made small (`class_variances`). Nothing but the
-robot's poses holds an offset of a view then. `plane_weights` is plane to plane (GICP) inside Tukey's biweight: of the
-families compared in docs/register.md the best. Both of its factors are 1 where two views agree, and neither depends on
-the order of the views.
+- *Variance-minimisation matching.* mean(d²) = Var(d) + mean(d)²; only Var(d) is made small there, so that an offset
+  common to all points of a view costs nothing. Here it costs nothing for a view that shows one (`shared_offsets`), and
+  counts in full for all others: their offset is the step that stitching has to close. Set free for every view it would
+  leave a third more error (docs/register.md).
+- *Weighted plus-and-minus allowance variance minimisation.* Distances above and below the middle are a plus and a minus
+  class, each with a scale. Here the middle is the weighted median, so that both classes hold the same weight and
+  exchange their places with the views; the cleaner class gives both their scale.
+
+`vmm` is that family as published: a class has its own mean, its distances weigh by how near they lie to it, and the sum
+of both variances is made small (`class_variances`). Nothing but the robot's poses holds an offset of a view then.
+
+`gicp` is plane to plane inside Tukey's biweight: of the methods compared in docs/register.md the best. Both factors of
+its weights are 1 where two views agree, and neither depends on the order of the views.
 """
 
 from collections.abc import Sequence
@@ -47,28 +49,29 @@ _ROUNDING = 1e-12
 
 
 def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
-    """Return weights (M,) per match: w = tukey((d − μ)/σ) · agreement · √(cos·cos') · density^ρ.
+    """Return the weights (M,) of each match: tukey(e/σ) · incidence · density, e a distance less the pair's median.
 
-    - distance and sign class: μ is the weighted median of the pair's distances, σ that of the cleaner of the two
-      classes d > μ and d < μ (`class_scale`). Source: exp(−(d−μ±)²/2σ±²); choice: Tukey's biweight and one middle,
-      since about the mean of its own half perfect agreement counts less than half.
-    - incidence: geometric mean of both cosines, and the agreement of both normals (Segal, Haehnel & Thrun 2009).
-    - density: `density`, the surface that a correspondence stands for.
+    The median is weighted by incidence and density. σ is the scale of the cleaner of the two classes e > 0 and e < 0
+    (`class_scale`). The published weight exp(−(d − μ±)²/2σ±²), about the mean of each class, would give perfect
+    agreement less than half: hence Tukey's biweight about one middle.
 
-    All factors are the same whichever view comes first, and none changes if all d of a pair grow by one offset.
+    All factors are the same whichever view comes first, and none changes if all distances of a pair grow alike.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
     """
     base = [incidence(m, capture, poses) * density(m, capture) for m in matches]
-    middle = [weighted_median(m.residual, b) for m, b in zip(matches, base, strict=True)]
-    centred = [m.residual - mu for m, mu in zip(matches, middle, strict=True)]
-    scale = mad_sigma(np.concatenate(centred))
-    return [b * tukey(e, class_scale(e, scale)) for b, e in zip(base, centred, strict=True)]
+    centred = [m.residual - weighted_median(m.residual, w) for m, w in zip(matches, base, strict=True)]
+    # A pair of few correspondences leans on the scale of all of them.
+    common_scale = mad_sigma(np.concatenate(centred))
+    return [w * tukey(e, class_scale(e, common_scale)) for w, e in zip(base, centred, strict=True)]
 
 
 def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
-    """Return weights (M,) per match of two classes, d ≥ 0 and d < 0: w = exp(−(d − μ±)²/2σ±²) · incidence · density.
+    """Return the weights (M,) of each match: exp(−(d − μ±)²/2σ±²) · incidence · density, for two classes of distances.
 
-    As published for allowances: μ± is the weighted mean of a class and σ± its robust sigma. Perfect agreement counts
-    less than half then, since the mean of a half-normal lies at 0.8 σ.
+    The classes are d ≥ 0 and d < 0, μ± the weighted mean of a class and σ± its robust sigma, as published. Perfect
+    agreement counts less than half then, since the mean of a half-normal lies at 0.8 σ.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
@@ -76,9 +79,9 @@ def vmm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> lis
     weights = []
     for m in matches:
         w = incidence(m, capture, poses) * density(m, capture)
-        for side in _sides(m):
-            off = m.residual[side] - w[side] @ m.residual[side] / w[side].sum()
-            w[side] *= np.exp(-0.5 * (off / max(mad_sigma(off), _ROUNDING)) ** 2)
+        for of_class in _sign_classes(m):
+            off = m.residual[of_class] - w[of_class] @ m.residual[of_class] / w[of_class].sum()
+            w[of_class] *= np.exp(-0.5 * (off / max(mad_sigma(off), _ROUNDING)) ** 2)
         weights.append(w)
     return weights
 
@@ -90,26 +93,28 @@ def class_variances(g: Gram, matches: Sequence[Match], weights: Sequence[Array])
     class's mean. Both classes have equal weight, together that of the pair.
 
     Args:
+        g: the sums, of which pairs, centre and scale stay.
         weights: (M,) per match.
     """
     matrix, vector, square = np.zeros_like(g.matrix), np.zeros_like(g.vector), np.zeros_like(g.square)
     for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
         rows = frames.plane_rows(m.middle - g.centre, m.normal)
-        sides = _sides(m)
-        for side in sides:
-            of_class = w[side] * w.sum() / (len(sides) * w[side].sum())
-            B = rows[side] - w[side] @ rows[side] / w[side].sum()
-            e = m.residual[side] - w[side] @ m.residual[side] / w[side].sum()
-            matrix[i] += (B * of_class[:, None]).T @ B
-            vector[i] += (B * of_class[:, None]).T @ e
-            square[i] += of_class @ e**2
+        classes = _sign_classes(m)
+        for of_class in classes:
+            total = w[of_class].sum()
+            B = rows[of_class] - w[of_class] @ rows[of_class] / total
+            e = m.residual[of_class] - w[of_class] @ m.residual[of_class] / total
+            weight = w[of_class] * w.sum() / (len(classes) * total)
+            matrix[i] += (B * weight[:, None]).T @ B
+            vector[i] += (B * weight[:, None]).T @ e
+            square[i] += weight @ e**2
     return replace(g, matrix=matrix, vector=vector, square=square)
 
 
-def _sides(m: Match) -> list[Indices]:
-    """Return the distances of the plus and of the minus class, where there are any."""
-    sides = (np.flatnonzero(m.residual >= 0), np.flatnonzero(m.residual < 0))
-    return [side for side in sides if len(side)]
+def _sign_classes(m: Match) -> list[Indices]:
+    """Return the indices of the distances d ≥ 0, and of those d < 0; one list where all have one sign."""
+    classes = (np.flatnonzero(m.residual >= 0), np.flatnonzero(m.residual < 0))
+    return [indices for indices in classes if len(indices)]
 
 
 def incidence(m: Match, capture: Capture, poses: Array) -> Array:
@@ -142,33 +147,24 @@ def class_scale(e: Array, scale: float) -> float:
 
     Args:
         e: (M,) distances of a pair, less their median, length_unit.
-        scale: robust sigma over all pairs; it counts like `_POOLED` further correspondences.
+        scale: robust sigma over all pairs; it counts like that of `_POOLED` further correspondences.
     """
-    # Sorted, each class is one stretch, and its median the middle of it.
-    e = np.sort(e)
-    above, below = len(e) - np.searchsorted(e, 0.0, side="right"), np.searchsorted(e, 0.0)
-    middles = [
-        abs(e[[first + (count - 1) // 2, first + count // 2]].mean())
-        for first, count in ((len(e) - above, above), (0, below))
-        if count >= _CLASS
-    ]
-    if not middles:
+    medians = [float(np.median(side)) for side in (e[e > 0], -e[e < 0]) if len(side) >= _CLASS]
+    if not medians:
         return scale
-    cleaner = MAD_TO_SIGMA * float(min(middles))
+    cleaner = MAD_TO_SIGMA * min(medians)
     return float(np.sqrt((len(e) * cleaner**2 + _POOLED * scale**2) / (len(e) + _POOLED)))
 
 
 class OffsetSums:
     """Sums over the correspondences by which offsets of the views' surfaces enter the normal equations.
 
-    The surface of view v stands off by a_v along its normals, so that a pair sees e + B(δ_v − δ_w) − (a_v − a_w). Of a
-    scan that had stock on a part of it, a acts there alone.
+    The surface of view v stands off by a_v along its normals, so that a pair sees e + B(δ_v − δ_w) − (a_v − a_w), with
+    twists δ of the views. Of a scan that had stock on a part of it, a acts there alone.
     """
 
     def __init__(self, g: Gram, matches: Sequence[Match], weights: Sequence[Array], capture: Capture) -> None:
-        """Sum over the correspondences of all pairs what offsets a_v need in the normal equations beside twists δ_v.
-
-        A distance is e + B(δ_v − δ_w) − (a_v − a_w); a and δ of V views are unknown.
+        """Sum over the correspondences of all pairs.
 
         Args:
             g: sums over the pairs for the twists alone.
@@ -181,17 +177,17 @@ class OffsetSums:
         self.square = np.zeros(len(matches))  # (P,) Σ w (e − ē)²: a pair's weighted variance, times its weight
         self.known = [v for v, scan in enumerate(capture.scans) if scan.stock is not None]
         for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
-            weight, first = float(w.sum()), float(w @ m.residual)
             rows = frames.plane_rows(m.middle - g.centre, m.normal)
-            sides = {m.v: acts(capture, m.v, m.index_v), m.w: -acts(capture, m.w, m.index_w)}
-            for b, of_b in sides.items():
-                pull = (w * of_b) @ rows
-                self.vector[b] += (w * of_b) @ m.residual
-                self.coupling[m.v, :, b] += pull
-                self.coupling[m.w, :, b] -= pull
-                for a, of_a in sides.items():
-                    self.matrix[a, b] += w @ (of_a * of_b)
-            self.square[i] = float(w @ m.residual**2) - first**2 / max(weight, 1e-300)
+            # By view of the pair, the change of each distance by a unit of its offset, less its sign.
+            changes = {m.v: acts(capture, m.v, m.index_v), m.w: -acts(capture, m.w, m.index_w)}
+            for view, change in changes.items():
+                pull = (w * change) @ rows
+                self.vector[view] += (w * change) @ m.residual
+                self.coupling[m.v, :, view] += pull
+                self.coupling[m.w, :, view] -= pull
+                for other, of_other in changes.items():
+                    self.matrix[other, view] += w @ (of_other * change)
+            self.square[i] = float(w @ m.residual**2) - float(w @ m.residual) ** 2 / max(float(w.sum()), 1e-300)
 
 
 def acts(capture: Capture, view: int, index: Indices) -> Array:
@@ -214,14 +210,16 @@ def with_offsets(
         variance: of a correspondence's distance, length_unit², by which the sums are divided.
         scale: robust sigma of the distances, length_unit.
     """
-    C, D, e = sums.coupling.reshape(len(H), -1) / variance, sums.matrix / variance, sums.vector / variance
-    information = D - C.T @ np.linalg.solve(H, C)
-    free = shared_offsets(information, e - C.T @ np.linalg.solve(H, b), _LARGE * scale, sums.known)
+    coupling = sums.coupling.reshape(len(H), -1) / variance
+    matrix, vector = sums.matrix / variance, sums.vector / variance
+    # Of the offsets alone, the twists eliminated.
+    information = matrix - coupling.T @ np.linalg.solve(H, coupling)
+    gradient = vector - coupling.T @ np.linalg.solve(H, b)
+    free = shared_offsets(information, gradient, _LARGE * scale, sums.known)
     if not free:
         return H, b, {}
-    H, b, sizes = eliminate(H, b, C[:, free], D[np.ix_(free, free)], e[free])
-    found = zip(free, map(float, sizes), strict=True)
-    return H, b, {v: size for v, size in found if v not in sums.known}
+    H, b, sizes = eliminate(H, b, coupling[:, free], matrix[np.ix_(free, free)], vector[free])
+    return H, b, {v: float(size) for v, size in zip(free, sizes, strict=True) if v not in sums.known}
 
 
 def eliminate(H: Array, b: Array, coupling: Array, matrix: Array, vector: Array) -> tuple[Array, Array, Array]:
@@ -234,7 +232,7 @@ def shared_offsets(information: Array, vector: Array, least: float, known: Seque
     """Return the views whose whole surface is offset, the most significant first; never all of them.
 
     In turn the view with the largest χ² = c²/A of its offset is freed, and the others are tested with it free. It ends
-    where no χ² is above `_SURE` with an offset |c/A| of at least `least`. An offset common to all views shows nowhere.
+    where no χ² is above `_SURE` with an offset |c/A| above `least`. An offset common to all views shows nowhere.
 
     Args:
         information: A (V, V) of the offsets, the twists eliminated.
@@ -248,13 +246,13 @@ def shared_offsets(information: Array, vector: Array, least: float, known: Seque
     while len(free) < len(A) - 1:
         size = np.maximum(np.diag(A), blind)
         chi2 = np.where(np.isin(np.arange(len(A)), free), 0.0, c**2 / size)
-        shown = (chi2 > _SURE) & (np.abs(c) > least * size)
+        is_offset = (chi2 > _SURE) & (np.abs(c) > least * size)
         due = [v for v in known if v not in free and A[v, v] > blind]
-        shown[due] = True
+        is_offset[due] = True
         chi2[due] = np.inf
-        if not shown.any():
+        if not is_offset.any():
             break
-        best = int(np.argmax(np.where(shown, chi2, 0.0)))
+        best = int(np.argmax(np.where(is_offset, chi2, 0.0)))
         free.append(best)
         column = A[:, best] / size[best]
         A, c = A - np.outer(column, A[best]), c - column * c[best]

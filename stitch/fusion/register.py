@@ -32,9 +32,8 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import symmetric_inverse
 from stitch.observations.surfaces.hand_eye_fit import Repeatability, hand_eye_jacobian
-from stitch.observations.surfaces.matching import Match, sample_points
+from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import (
-    FINE_SAMPLES,
     NEAR_NULL,
     Gram,
     Overlaps,
@@ -127,10 +126,13 @@ def register(
         NoResultError: no two views overlap.
     """
     recorder = recorder or SilentRecorder()
-    samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses = np.array(model_poses if start is None else _without_mean_motion(start, model_poses))
+    poses = np.array(model_poses)
+    if start is not None:
+        # No overlap shows the mean of the motions from the model's poses.
+        common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
+        poses = frames.exp(-common) @ start
     history: list[float] = []
-    overlaps = collect_overlaps(capture, poses, gate, samples, before)
+    overlaps = collect_overlaps(capture, poses, gate, before=before)
     last: LastStep = None
     progress = _Progress()
     for index in range(_MAXIMUM_ITERATIONS):
@@ -148,14 +150,8 @@ def register(
             break
         poses, last = take_step(poses, g, step, last)
         gate = tighter
-        overlaps = collect_overlaps(capture, poses, gate, samples, overlaps)
+        overlaps = collect_overlaps(capture, poses, gate, before=overlaps)
     return replace(best, history=tuple(history), note=progress.note(len(history)))
-
-
-def _without_mean_motion(start: Array, model_poses: Array) -> Array:
-    """Return poses `start` (V, 4, 4) without the mean of their motions from the model's, which no overlap can show."""
-    common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
-    return frames.exp(-common) @ start
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,10 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
     term = next((term for term in model.terms if term.name == PLACEMENT), None)
     near = _middle(measurement, model)
     names = [] if term is None else [f"{term.name}.{p.name}" for p in term.parameters]
-    covariance = _covariance_with_hand_eye(model, names)
+    covariance = model.covariance_with(names)
+    if (known := model.effects_covariance.with_hand_eye).size:
+        # Without the prior's part: only what the motions show.
+        covariance[:6, :6] = known[:, :6]
     places = []
     for k, axis in enumerate(axes.axes):
         place = _as_stated(measurement, model, term, k, near)
@@ -85,28 +88,6 @@ def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]
         point, point_sigma = (place[3:], sigma[3:]) if axis.is_rotary else (None, None)
         places.append(AxisPlace(axis.name, axis.kind, place[:3], sigma[:3], point, point_sigma, unobservable))
     return tuple(places)
-
-
-def _covariance_with_hand_eye(model: Model, names: list[str]) -> Array:
-    """Return the covariance (6 + P, 6 + P) of the hand-eye's twist, T·exp(ξ), and of P parameters of axis_placement.
-
-    Rows of parameters that were not fitted are zero.
-
-    Args:
-        names: effect.parameter of the P parameters.
-    """
-    known = model.effects_covariance
-    size = 6 + len(names)
-    covariance = np.zeros((size, size))
-    covariance[:6, :6] = known.with_hand_eye[:, :6] if known.with_hand_eye.size else model.covariance
-    fitted = [i for i, name in enumerate(names) if name in known.names]
-    rows = 6 + np.array(fitted, int)
-    index = np.array([known.names.index(names[i]) for i in fitted], int)
-    covariance[np.ix_(rows, rows)] = known.matrix[np.ix_(index, index)]
-    if known.with_hand_eye.size:
-        covariance[:6, rows] = known.with_hand_eye[:, 6 + index]
-        covariance[rows, :6] = covariance[:6, rows].T
-    return covariance
 
 
 def _moved(model: Model, term: Term | None, step: Array) -> tuple[Model, Term | None]:

@@ -170,21 +170,21 @@ def target_correction(
     return np.where((sightings.target >= 0)[..., None], correction, 0.0)
 
 
-def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array, steps: int = 2) -> Array:
+def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array) -> Array:
     """Return the position (V, S, 3), reference frame, of the target in each slot: the mean of all views that use it.
 
-    Effects are evaluated there. At the measured point an effect's column would contain that point's own error, and the
-    fit would explain the error by it (errors in variables; Fuller 1987, Measurement Error Models).
+    Effects are evaluated at these positions. At the measured point an effect's column would contain that point's own
+    error, and the fit would explain the error by it (errors in variables; Fuller 1987, Measurement Error Models).
 
     Args:
         poses: (V, 4, 4) T_reference_scanner.
-        steps: of the fixed point between positions and corrections, where effects move points.
     """
     sightings = measurement.capture.sightings
     assert sightings is not None
     measured = frames.transform(poses, sightings.points)
     places = _mean_places(sightings, measured)
-    for _ in range(steps if moves_points(terms) else 0):
+    # Positions and corrections depend on each other: two steps of the fixed point, as in `point_correction`.
+    for _ in range(2 if moves_points(terms) else 0):
         correction = target_correction(measurement, terms, poses, places)
         places = _mean_places(sightings, measured + frames.rotate(poses, correction))
     return places

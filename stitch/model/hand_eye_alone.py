@@ -4,13 +4,12 @@ Effects of base, arm and mount place every view a little elsewhere. A program th
 what they do on the average over the views, if the hand-eye holds it; what they do from view to view it does not.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from stitch.model.forward import perturbed_frames
-from stitch.model.model import ARM_PLACES, Model, Term
+from stitch.model.model import ARM_PLACES, Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.measurement import Measurement
@@ -36,7 +35,9 @@ def hand_eye_alone(measurement: Measurement, model: Model) -> HandEyeAlone | Non
     model has no such effects, and with several scanners, which have no hand-eye in common.
     """
     places = (*ARM_PLACES, "mount")
-    terms = _as_in_the_end([term for term in model.terms if term.effect.place in places and not term.is_geometry])
+    used = [term for term in model.terms if term.effect.place in places and not term.is_geometry]
+    # As after the last view: an event counts as if it were before the first.
+    terms = [term.at(np.array([0.0 if p.discrete else p.value for p in term.parameters])) for term in used]
     if not terms or measurement.views.scanners:
         return None
     left, right = perturbed_frames(measurement, terms)
@@ -59,8 +60,3 @@ def hand_eye_alone(measurement: Measurement, model: Model) -> HandEyeAlone | Non
         displacement=float(moved(model.T_mount)[0]),
         spread=float(np.sqrt(np.mean(moved(of_views) ** 2))),
     )
-
-
-def _as_in_the_end(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms as they are after the last view: an event counts as if it were before the first."""
-    return [term.at(np.array([0.0 if p.discrete else p.value for p in term.parameters])) for term in terms]

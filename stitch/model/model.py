@@ -6,7 +6,7 @@ translation of T in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so
 errors of one go with errors of another.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -29,8 +29,6 @@ ARM_PLACES = ("base", "robot", "links")  # where the effects of an arm stand in 
 COVERAGE_FACTOR = 2.0
 # A person may edit the sigmas of model.toml; then the matrix of the fit is no longer theirs.
 _SAME_SIGMA = 1e-6
-# Of a twist, for central differences: far above rounding, far below the bend of any angle.
-_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +191,26 @@ class Model(Value):
         """
         return self.with_terms([*self.without(term.name).terms, term])
 
+    def covariance_with(self, names: Sequence[str]) -> Array:
+        """Return the covariance (6 + P, 6 + P) of the hand-eye's twist, T_mount·exp(ξ), and of P parameters.
+
+        Rows of parameters that were not fitted are zero.
+
+        Args:
+            names: effect.parameter of each of the P parameters.
+        """
+        known = self.effects_covariance
+        covariance = np.zeros((6 + len(names), 6 + len(names)))
+        covariance[:6, :6] = self.covariance
+        fitted = [i for i, name in enumerate(names) if name in known.names]
+        rows = 6 + np.array(fitted, int)
+        index = np.array([known.names.index(names[i]) for i in fitted], int)
+        covariance[np.ix_(rows, rows)] = known.matrix[np.ix_(index, index)]
+        if known.with_hand_eye.size:
+            covariance[:6, rows] = known.with_hand_eye[:, 6 + index]
+            covariance[rows, :6] = covariance[:6, rows].T
+        return covariance
+
     def __repr__(self) -> str:
         effects = ", ".join(self.effects) or "no effects"
         position = ", ".join(f"{x:.4g}" for x in self.T_mount[:3, 3])
@@ -314,19 +332,6 @@ def printed_covariance(T_mount: Array, covariance: Array) -> Array:
     J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
     J[3:, 3:] = T_mount[:3, :3]
     return J @ covariance @ J.T
-
-
-def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
-    """Return the covariance (n, n) of the numbers by which a controller states a hand-eye, to first order.
-
-    Args:
-        numbers: function of a pose (4, 4) that returns those numbers (n,), continuous near T_mount.
-        T_mount: (4, 4) T_mount_scanner.
-        covariance: (6, 6) of the right perturbation, rotation first.
-    """
-    steps = _STEP * np.eye(6)
-    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
-    return np.transpose(J) @ covariance @ np.array(J)
 
 
 def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:

@@ -23,8 +23,8 @@ _BLOCKS_A_GROUP, MANY_BLOCKS = 20, 50
 # Matrices of blocks of one covariance differ by rounding, as a share; directions with less than the second share of the
 # largest eigenvalue are none, and between that and the third a turn would be imprecise.
 _SAME, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
-# Numbers of turned columns that are kept: 50 MB. Their products are small.
-_KEPT_NUMBERS = 6_000_000
+# Numbers of turned columns that are cached: 50 MB. Their products are small.
+_CACHED_NUMBERS = 6_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,21 +120,21 @@ class CommonCovariance:
         """Return the sums over blocks of products of columns a (p) and b (q), per pair of turned numbers: (t, p, q)."""
         if a.keep is None or b.keep is None:
             return pair_products(self.turned(a), self.turned(b))
-        return b.of(a.of(self._kept_products(a.whole, b.whole), 1), 2)
+        return b.of(a.of(self._cached_products(a.whole, b.whole), 1), 2)
 
     def weighted(self, pairs: Array, a: SelectedColumns, b: SelectedColumns) -> Array:
         """Return aᵀV⁻¹b (p, q) from weights of the pairs (t,); the products of columns are cached for other weights."""
-        products = self._kept_products(a.whole, b.whole)
+        products = self._cached_products(a.whole, b.whole)
         return b.of(a.of((pairs @ products.reshape(len(pairs), -1)).reshape(products.shape[1:]), 0), 1)
 
-    def _kept_products(self, a: Array, b: Array) -> Array:
+    def _cached_products(self, a: Array, b: Array) -> Array:
         """Return the products (t, P, Q) of two whole sets of columns (n, P) and (n, Q), from the cache where they are.
 
         Both orders, ab and ba, are stored.
         """
         products = self._products.get((id(a), id(b)))
         if products is None:
-            products = pair_products(self._kept(a), self._kept(b))
+            products = pair_products(self._cached(a), self._cached(b))
             back = np.ascontiguousarray(products.transpose(0, 2, 1))
             self._products.update({(id(a), id(b)): products, (id(b), id(a)): back})
         return products
@@ -146,10 +146,10 @@ class CommonCovariance:
         """
         if columns.keep is None:
             return self._turn(columns.whole)
-        return [columns.of(part, 0) for part in self._kept(columns.whole)]
+        return [columns.of(part, 0) for part in self._cached(columns.whole)]
 
-    def keep(self, wholes: Sequence[Array]) -> None:
-        """Turn sets of columns (n, P) and cache them: all in one product, since many small ones take longer."""
+    def cache(self, wholes: Sequence[Array]) -> None:
+        """Cache the turned numbers of sets of columns (n, P): all in one product, since many small ones take longer."""
         new = [
             whole for whole in wholes if id(whole) not in self._turned and (id(whole), id(whole)) not in self._products
         ]
@@ -157,12 +157,12 @@ class CommonCovariance:
             ends = np.cumsum([whole.shape[1] for whole in new])[:-1]
             parts = [np.split(part, ends) for part in self._turn(np.hstack(new))]
             for whole, *turned in zip(new, *parts, strict=True):
-                self._kept(whole, turned)
+                self._cached(whole, turned)
 
-    def _kept(self, whole: Array, turned: list[Array] | None = None) -> list[Array]:
+    def _cached(self, whole: Array, turned: list[Array] | None = None) -> list[Array]:
         """Return the turned columns of a whole set (n, P), and cache them.
 
-        Beyond `_KEPT_NUMBERS` the sets that were asked for longest ago leave the cache.
+        Beyond `_CACHED_NUMBERS` the sets that were asked for longest ago leave the cache.
 
         Args:
             turned: the result, where the caller has it already.
@@ -173,7 +173,7 @@ class CommonCovariance:
         self._sizes[id(whole)] = sum(part.size for part in turned)
         # Python's dicts keep the order of insertion: the oldest come first. Copies and defaults, since several threads
         # share the cache.
-        excess = sum(self._sizes.copy().values()) - _KEPT_NUMBERS
+        excess = sum(self._sizes.copy().values()) - _CACHED_NUMBERS
         for key in list(self._turned)[:-1]:
             if excess <= 0:
                 break
@@ -211,7 +211,7 @@ class MeanSums:
     known_products: Array | None = None  # the value of `products`, where it is known already
 
     @property
-    def are_kept(self) -> bool:
+    def are_cached(self) -> bool:
         """True if products of these columns with others are cached."""
         return all(columns.keep is not None for columns in self.sets)
 
@@ -224,7 +224,7 @@ class MeanSums:
 
     def products_with(self, columns: SelectedColumns) -> Array:
         """Return the sums over blocks (t, a + 1, p) of products with p other columns, per pair of turned numbers."""
-        if columns.keep is None or not self.are_kept:
+        if columns.keep is None or not self.are_cached:
             return pair_products(self._turned, self.common.turned(columns))
         return np.concatenate([self.common.products(held, columns) for held in self.sets], axis=1)
 

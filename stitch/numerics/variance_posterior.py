@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from stitch.numerics.frames import Array, Mask
+from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import column_space
 from stitch.numerics.reml import (
     NOISE,
@@ -126,11 +126,12 @@ class _MeanFreeData:
 
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
-    """Return posterior means (c,) of the variances, by Gibbs sampling on a grid of each, from their maximum on.
+    """Return posterior means (c,) of the variances, by Gibbs sampling on a grid of each, begun at their maximum.
 
-    In each round every variance is drawn given the others, and its conditional mean is what is averaged. Then the
-    factor is drawn by which the prior's usual sizes of some components are multiplied together (`common_factor`): an
-    arm may err more than usual in all of them. The first rounds are not counted. Components that are zero have mean 0.
+    The prior says how large each error of an arm usually is. An arm may be worse than usual in all of them, so that one
+    factor multiplies the usual sizes of these components together (`common_factor`). A round draws each variance given
+    the others and the factor, then the factor given the variances. What is averaged over the rounds are the means of a
+    variance over its grid; the first rounds do not count. A component that the mean's columns absorb has mean 0.
 
     The maximum itself is returned from `_NO_ROUNDS` observations on, where a round takes seconds, and where the mean
     leaves no observation over.
@@ -143,44 +144,45 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     data, rng = _remove_mean(mixed), np.random.default_rng(0)
     if not len(data.z):
         return fit.variances
-    shares_factor = np.zeros(len(mixed.components), bool)
-    if mixed.further is not None:
-        shares_factor[NOISE + 1 :] = mixed.further.common_factor
     grids = _grids(mixed, fit.variances)
-    densities = _densities(mixed, grids, shares_factor)
-    with_factor = [i for i in np.flatnonzero(shares_factor) if data.roots[i].shape[1]]
-    # The state of the chain: the variances, their places on the grids, and the factor, a number of `_FACTORS`.
-    current, place, factor = np.array(fit.variances), np.zeros(len(grids), int), _USUAL
+    priors = _log_priors(mixed, grids)
+    drawn = [i for i, root in enumerate(data.roots) if root.shape[1]]
+    with_factor = [i for i in drawn if len(priors[i]) > 1]
+    variances, on_grid, factor = np.array(fit.variances), np.zeros(len(grids), int), _USUAL
     sums_of_means = np.zeros(len(grids))
     rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
     burn_in = -(-_BURN_IN * rounds // _ROUNDS)
     for number in range(burn_in + rounds):
-        for i, grid in enumerate(grids):
-            if data.roots[i].shape[1]:
-                weights = _grid_weights(data, current, i, grid, densities[i][factor if i in with_factor else 0])
-                place[i] = rng.choice(len(grid), p=weights)
-                current[i] = grid[place[i]]
-                if number >= burn_in:
-                    sums_of_means[i] += float(weights @ grid)
+        for i in drawn:
+            weights = _grid_weights(data, variances, i, grids[i], priors[i][factor if i in with_factor else 0])
+            on_grid[i] = rng.choice(len(weights), p=weights)
+            variances[i] = grids[i][on_grid[i]]
+            if number >= burn_in:
+                sums_of_means[i] += float(weights @ grids[i])
         if with_factor:
-            logs = _LOG_FACTOR_DENSITY + np.sum([densities[i][:, place[i]] for i in with_factor], axis=0)
-            weights = np.exp(logs - logs.max())
-            factor = int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
+            log_posterior = _LOG_FACTOR_DENSITY + np.sum([priors[i][:, on_grid[i]] for i in with_factor], axis=0)
+            factor = int(rng.choice(len(_FACTORS), p=_normalised(log_posterior)))
     return sums_of_means / rounds
 
 
-def _densities(mixed: MixedModel, grids: Sequence[Array], shares_factor: Mask) -> list[Array]:
-    """Return the log prior density of each variance on its grid: (1, g), or (F, g) for all F factors of `_FACTORS`.
+def _log_priors(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
+    """Return the log prior density of each variance on its grid (g,), for each of F factors on its usual size.
 
-    Args:
-        grids: per component, variances (g,).
-        shares_factor: (c,) components that share the factor on their usual sizes.
+    They are (F, g), a row for each of `_FACTORS`, where the component shares the factor; else (1, g).
     """
-    densities = []
-    for i, (grid, has_factor) in enumerate(zip(grids, shares_factor, strict=True)):
-        priors = [mixed.further.scaled(f) for f in _FACTORS] if has_factor and mixed.further else [mixed.further]
-        densities.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
-    return densities
+    log_priors = []
+    for i, grid in enumerate(grids):
+        priors = [mixed.further]
+        if mixed.further is not None and i > NOISE and mixed.further.common_factor[i - NOISE - 1]:
+            priors = [mixed.further.scaled(factor) for factor in _FACTORS]
+        log_priors.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
+    return log_priors
+
+
+def _normalised(logs: Array) -> Array:
+    """Return probabilities (n,) that sum to 1 from their logarithms, which are known up to a constant."""
+    weights = np.exp(logs - logs.max())
+    return weights / weights.sum()
 
 
 def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
@@ -219,7 +221,7 @@ def _grids(mixed: MixedModel, likeliest: Array) -> list[Array]:
     return [np.maximum(size, 1e-300) * np.exp(np.arange(_BELOW, _ABOVE, step)) for size in usual]
 
 
-def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, density: Array) -> Array:
+def _grid_weights(data: _MeanFreeData, variances: Array, i: int, grid: Array, log_prior: Array) -> Array:
     """Return the posterior probabilities (g,) of the values of variance i on its grid, given the other variances.
 
     V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ = R Rᵀ: one decomposition for the whole grid.
@@ -228,14 +230,14 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
 
     Args:
         data: observations z, components C and square roots of these.
-        current: (c,) variances now.
+        variances: (c,) λ, of all components now.
         grid: (g,) values of variance i.
-        density: (g,) its log prior there.
+        log_prior: (g,) its log prior there.
 
     Raises:
         LinAlgError: the covariance is not positive.
     """
-    covariance = data.fixed + np.tensordot(current, data.components, axes=1)
+    covariance = data.fixed + np.tensordot(variances, data.components, axes=1)
     # LAPACK directly: what scipy does around these routines takes longer than they do.
     L, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
     if failed:
@@ -246,7 +248,5 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
     m = np.maximum(m, 1e-300)
     a = v.T @ (R.T @ z)
     # Bounded, since by rounding the covariance could lose its last positive part.
-    t = np.maximum(1 + (grid[:, None] - current[i]) * m, 1e-12)
-    logs = density - 0.5 * (np.log(t) + a**2 / m * (1 / t - 1)).sum(axis=1)
-    weights = np.exp(logs - logs.max())
-    return weights / weights.sum()
+    t = np.maximum(1 + (grid[:, None] - variances[i]) * m, 1e-12)
+    return _normalised(log_prior - 0.5 * (np.log(t) + a**2 / m * (1 / t - 1)).sum(axis=1))

@@ -379,10 +379,10 @@ class LinearModel:
         Two ways give the same. Where all views have one covariance but for a rotation (`mixed.common`), sums over the
         views are cached and each set is made of these. Else the columns are whitened, several sets in one product.
         """
-        common = self.mixed.common if self.mixed.common is not None and self.mixed.sums.are_kept else None
+        common = self.mixed.common if self.mixed.common is not None and self.mixed.sums.are_cached else None
         for sets in (columns[start : start + _SETS_AT_ONCE] for start in range(0, len(columns), _SETS_AT_ONCE)):
             if common is not None:
-                common.keep([selected.whole for selected in sets])
+                common.cache([selected.whole for selected in sets])
                 yield from map(self._own_information.of, sets)
                 continue
             white = self.whiten(np.hstack([selected.columns for selected in sets]))

@@ -1,6 +1,5 @@
 """Where each of several scanners in one cell stands under their common model, beside what its own views alone say."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,8 +89,9 @@ def scanner_places(
         T_mount = model.T_mount @ T_first_scanner
         # A twist of the first scanner's hand-eye, seen in this scanner's frame, and one of its place from the first.
         J = np.hstack([frames.adjoint(frames.inverse(T_first_scanner)), np.eye(6)])
-        parameters = [] if k == 0 else [f"{term.name}.{term.parameters[i].name}" for i in order[k - 1]]
-        covariance = J @ _covariance_with_hand_eye(model, parameters) @ J.T
+        # The first scanner's place is the hand-eye: its six parameters are none, and do not vary.
+        parameters = [f"{term.name}.{term.parameters[i].name}" for i in order[k - 1]] if k else 6 * [""]
+        covariance = J @ model.covariance_with(parameters) @ J.T
         middle = seen_part([capture], k)[0]
         own = alone_by_name.get(name)
         U_alone = apart = float("nan")
@@ -113,27 +113,6 @@ def scanner_places(
             )
         )
     return tuple(places)
-
-
-def _covariance_with_hand_eye(model: Model, parameters: Sequence[str]) -> Array:
-    """Return the covariance (12, 12) of the hand-eye's twist (6) and of the six parameters that place a scanner.
-
-    Rows of parameters that were not fitted are zero.
-
-    Args:
-        parameters: their names, effect.parameter; none for the first scanner, whose place is the hand-eye.
-    """
-    known = model.effects_covariance
-    covariance = np.zeros((12, 12))
-    covariance[:6, :6] = model.covariance
-    index = {name: i for i, name in enumerate(known.names)}
-    fitted = [(6 + row, index[name]) for row, name in enumerate(parameters) if name in index]
-    for row, i in fitted:
-        if known.with_hand_eye.size:
-            covariance[:6, row] = covariance[row, :6] = known.with_hand_eye[:, 6 + i]
-        for column, j in fitted:
-            covariance[row, column] = known.matrix[i, j]
-    return covariance
 
 
 def contradictions(places: tuple[ScannerPlace, ...], length_unit: str) -> tuple[str, ...]:

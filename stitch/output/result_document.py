@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch.effects.axis_effects import SCANNER_PLACEMENT
 from stitch.effects.contract import Effect, Parameter
-from stitch.effects.user_source import FILE, source_of
+from stitch.effects.user_source import EFFECTS_FILE, source_of
 from stitch.errors import InputError
 from stitch.fusion.register import method_named, pose_covariance
 from stitch.model.hand_eye_alone import HandEyeAlone, hand_eye_alone
@@ -106,16 +106,16 @@ def model_of(run: RunData) -> ModelFile:
 
 
 def recorded_effects_file(run: RunData) -> str | None:
-    """Return the path of the user's effects that model.toml names, their one Python file or else `FILE`; None without.
+    """Return the path of the user's effects that model.toml names: their one Python file, or else `EFFECTS_FILE`.
 
-    `FILE` lies in the run folder itself; `effects_source` is its text.
+    None without such effects. `EFFECTS_FILE` lies in the run folder itself; `effects_source` is its text.
     """
-    origins = {effect.origin or run.effects_file or FILE for effect in own_effects(run)}
+    origins = {effect.origin or run.effects_file or EFFECTS_FILE for effect in own_effects(run)}
     if not origins:
         return None
     file = origins.pop()
-    # Several files become one. A file that is called FILE lies in the folder of another run, which may go.
-    return FILE if origins or Path(file).name == FILE else file
+    # Several files become one. A file that is called EFFECTS_FILE lies in the folder of another run, which may go.
+    return EFFECTS_FILE if origins or Path(file).name == EFFECTS_FILE else file
 
 
 def own_effects(run: RunData) -> list[Effect]:
@@ -125,16 +125,16 @@ def own_effects(run: RunData) -> list[Effect]:
 
 
 def effects_source(run: RunData) -> str | None:
-    """Return the text of `FILE`, the file of the user's effects in the run folder; None where none is needed.
+    """Return the text of `EFFECTS_FILE`, the file of the user's effects in the run folder; None where none is needed.
 
     Raises:
         InputError: the source of an effect is not at hand, or would not run on its own.
     """
     own = own_effects(run)
-    if recorded_effects_file(run) != FILE:
+    if recorded_effects_file(run) != EFFECTS_FILE:
         return None
     before = Path(own[0].origin or run.effects_file or "")
-    return before.read_text(encoding="utf-8") if before.name == FILE else source_of(own)
+    return before.read_text(encoding="utf-8") if before.name == EFFECTS_FILE else source_of(own)
 
 
 def _hand_eye_alone(run: RunData) -> HandEyeAlone | None:
@@ -204,11 +204,6 @@ def has_model(document: dict[str, Any], model: ModelFile) -> bool:
 def register_method(document: dict[str, Any]) -> str:
     """Return by which method a run registered single views; empty without clouds."""
     return next((stage["method"] for stage in document["stages"] if "method" in stage), "")
-
-
-def registered_gate(document: dict[str, Any]) -> float | None:
-    """Return the largest distance between partners after register; None where a result does not state it."""
-    return (document.get("disagreement") or {}).get("gate")
 
 
 def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovariance:
@@ -439,7 +434,11 @@ def scanners_alone(document: dict[str, Any]) -> tuple[ScannerAlone, ...]:
 
 
 def _disagreement(run: RunData) -> dict[str, Any] | None:
-    """Return how far the views disagree on the part at every step of the ledger, length_unit; None without clouds."""
+    """Return how far the views disagree on the part, length_unit, for every step of the model's history.
+
+    Of each step the mean distance over the part (`mean`), what of it noise alone would make (`of_noise`), and the
+    distance that nearly all of the part stays below (`largest`). None without clouds.
+    """
     history = model_history(run)
     if history is None or run.registered is None:
         return None

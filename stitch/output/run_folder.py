@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from stitch.effects import EFFECTS
-from stitch.effects.user_source import FILE
+from stitch.effects.user_source import EFFECTS_FILE
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model, write_model
 from stitch.numerics.frames import Array
@@ -345,7 +345,7 @@ def write_model_with_effects(run: RunData, folder: Path) -> None:
     """Write model.toml, and beside it the source of effects that no other file holds."""
     source = effects_source(run)
     if source is not None:
-        (folder / FILE).write_text(source, encoding="utf-8")
+        (folder / EFFECTS_FILE).write_text(source, encoding="utf-8")
     write_model(model_of(run), folder / "model.toml")
 
 

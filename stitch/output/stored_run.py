@@ -15,8 +15,7 @@ from stitch.model.forward import corrected_capture
 from stitch.model.model import EffectsCovariance
 from stitch.model.model_toml import ModelFile, bind_to_session, read_model, with_model_axes, with_model_scanners
 from stitch.numerics.frames import Array
-from stitch.observations.surfaces.matching import sample_points
-from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
+from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output import result_document as results
 from stitch.output.schema import read_checked
@@ -28,6 +27,7 @@ from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
 from stitch.session.scanners import join_sessions
+from stitch.session.session import SessionData
 from stitch.system.packages import arrow_alone, stitch_version
 from stitch.system.ply_file import vertex_columns
 from stitch.system.threads import library_threads_off
@@ -125,19 +125,13 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     """
     document, steps = read_documents(folder)
     file, effects = trusted_model(folder, effects_file, trust, document)
-    paths = [Path(path) for path in document.get("sessions", [document["session"]])]
-    gone = next((path for path in paths if not path.is_dir()), None)
-    if gone is not None:
-        raise InputError(f"{folder}/result.json: its session {gone} has gone; to fix: restore it or correct the path")
-    parts = [with_model_axes(load_session(path), file) for path in paths]
-    session = join_sessions(with_model_scanners(parts, file)) if len(parts) > 1 else parts[0]
+    whole_session = _session_of_run(folder, document, file)
+    left_out = results.excluded_views(document)
+    session = whole_session.without([item.view for item in left_out])
     # The order is that of a run: views, model, points that count, gate, stock. Each needs those before it.
     with library_threads_off():
-        measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
-        left_out = results.excluded_views(document)
-        excluded = [item.view for item in left_out]
-        measurement = measurement.without([v for v, view in enumerate(session.views) if view.name in excluded])
-        session = session.without(excluded)
+        whole = with_part_origin(measurement_of(whole_session, prepare_capture(whole_session)), file.T_mount_coarse)
+        measurement = whole.without([v for v, name in enumerate(whole_session.names) if name not in session.names])
         model = bind_to_session(file, measurement)
         measurement = results.restore_counted_targets(measurement, session, document)
         capture = corrected_capture(measurement, model)
@@ -162,6 +156,25 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         alone=results.scanners_alone(document),
         **results.RESULT.fields(document, RunData),
     )
+
+
+def _session_of_run(folder: Path, document: dict[str, Any], file: ModelFile) -> SessionData:
+    """Return the session that a run is of, read again, all of its views; of several scanners their sessions joined.
+
+    Args:
+        folder: of the run, for messages.
+        document: result.json.
+        file: the run's model, which says where axes and scanners stood before the fit.
+
+    Raises:
+        InputError: a session's folder has gone or cannot be read, or session and model have other axes or scanners.
+    """
+    paths = [Path(path) for path in document.get("sessions", [document["session"]])]
+    gone = next((path for path in paths if not path.is_dir()), None)
+    if gone is not None:
+        raise InputError(f"{folder}/result.json: its session {gone} has gone; to fix: restore it or correct the path")
+    sessions = [with_model_axes(load_session(path), file) for path in paths]
+    return join_sessions(with_model_scanners(sessions, file)) if len(sessions) > 1 else sessions[0]
 
 
 def read_diagnosis(folder: Path) -> dict[str, Any]:
@@ -278,8 +291,9 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
         capture = corrected_capture(run.measurement, run.model)
         if capture.scans:
             overlaps = converged_overlaps(capture, run.model.T_mount, run.gate)
-            samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
-            registered = collect_overlaps(capture, poses, results.registered_gate(document) or run.gate, samples)
+            # Of register, where the result states it.
+            gate = (document.get("disagreement") or {}).get("gate") or run.gate
+            registered = collect_overlaps(capture, poses, gate)
         if document.get("targets") and capture.sightings is not None:
             targets = _target_fit(folder, run)
     return Fit(

@@ -108,11 +108,6 @@ class Axes:
             return -1
         return next((k for k, axis in enumerate(self.axes) if axis.is_rotary), 0)
 
-    @property
-    def are_placed(self) -> bool:
-        """True if it is known of all axes from where to start."""
-        return all(axis.is_placed for axis in self.axes)
-
     def stands_right(self, axis: Axis) -> bool:
         """Return True if an axis is a factor of A_right in T_base_flange' = A_left⁻¹ · A_right · T_base_flange."""
         return axis.carries == ("robot" if self.has_robot else "part")

@@ -21,7 +21,7 @@ from stitch.session.scan import (
     prepare_scan,
     without_stock,
 )
-from stitch.session.scanners import scanner_of, scanners_of, stops_of
+from stitch.session.scanners import scanners_of, stops_of
 from stitch.session.session import Cloud, Scanner, SessionData
 from stitch.system.threads import parallel
 from stitch.system.values import take_rows
@@ -243,7 +243,9 @@ def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
     Where memory allows, the neighbours of all points are found first. The library does that without the interpreter's
     lock, which other threads that still import modules hold again and again.
     """
-    seen = [(scanner_of(session, view), view.cloud) for view in session.views if view.cloud is not None]
+    # Each view with its scanner's description; of several scanners each has a session.
+    scanners = [part.scanner for part in session.parts] or [session.scanner]
+    seen = [(scanners[view.scanner], view.cloud) for view in session.views if view.cloud is not None]
     clouds = [cloud for _, cloud in seen]
     whole = [None if cloud.whole is not None else cloud.points for cloud in clouds]
     around: Iterable[Neighbourhoods | None] = [None] * len(whole)

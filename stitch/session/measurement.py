@@ -21,7 +21,7 @@ from stitch.session.axis_poses import axes_of
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
 from stitch.session.scanners import Scanners, scanners_of
-from stitch.session.session import Mount, SensorKind, SessionData
+from stitch.session.session import Mount, SensorKind, SessionData, View
 from stitch.session.torques import Torques, no_torques, torque_columns, torques_of_views
 from stitch.system.values import take_rows
 
@@ -387,30 +387,25 @@ def views_of(session: SessionData) -> Views:
     axes = axes_of(session)
     scanners = scanners_of(session)
     count = len(views)
-    has_joints = session.robot is not None and all(view.joints is not None for view in views)
-    joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
-    approach = np.array([view.approach for view in views]) if has_joints else np.zeros((count, 0))
-    time = np.array([np.nan if view.time_s is None else view.time_s for view in views])
-    # A column with a gap does not count.
-    complete = set.intersection(*(set(view.covariates) for view in views))
-    covariates = {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}
-    speeds = [f"j{i + 1}_velocity_deg_s" for i in range(joints.shape[1])]
-    velocity = None
-    if speeds and all(name in covariates for name in speeds):
-        velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds]))
+    joints = approach = np.zeros((count, 0))
     torques = no_torques(count)
-    if session.robot is not None and has_joints:
-        torques = torques_of_views(session.robot, joints, covariates)
-    if torques.measured:
-        for name in torque_columns(joints.shape[1]):
-            del covariates[name]
+    columns = _complete_columns(views)
+    if session.robot is not None and all(view.joints is not None for view in views):
+        joints = np.array([view.joints for view in views])
+        approach = np.array([view.approach for view in views])
+        torques = torques_of_views(session.robot, joints, columns)
+    speeds = [f"j{i + 1}_velocity_deg_s" for i in range(joints.shape[1])]
+    has_velocity = bool(speeds) and columns.keys() >= set(speeds)
+    known_otherwise = (speeds if has_velocity else []) + (torque_columns(joints.shape[1]) if torques.measured else [])
+    covariates = {name: values for name, values in columns.items() if name not in known_otherwise}
+    time = np.array([np.nan if view.time_s is None else view.time_s for view in views])
     return Views(
         count=count,
         time=time - time[0],
         joints=joints,
         previous=np.vstack([joints[:1], joints[:-1]]),
         approach=approach,
-        velocity=velocity,
+        velocity=np.radians(np.column_stack([columns[name] for name in speeds])) if has_velocity else None,
         torques=torques,
         covariates=covariates,
         standoff=session.scanner.standoff or _median_range(session),
@@ -428,6 +423,12 @@ def views_of(session: SessionData) -> Views:
             for of_view in scanners.masks(count)
         ),
     )
+
+
+def _complete_columns(views: Sequence[View]) -> dict[str, Array]:
+    """Return name -> values (V,) of the columns of views.csv that have a number in every view, sorted by name."""
+    complete = set.intersection(*(set(view.covariates) for view in views))
+    return {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}
 
 
 def _gravity_of_views(axes: Axes, session: SessionData) -> Array:

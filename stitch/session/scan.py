@@ -322,7 +322,7 @@ def _bent_normals(points: Array, centres: Array, normals: Array, index: Indices)
 
 
 class _Quadrics(NamedTuple):
-    """Quadrics fitted to the k neighbours of each of N points, with m = 5 terms besides a constant."""
+    """Quadrics fitted to the k neighbours of each of N points, with m = 5 terms beside a constant."""
 
     residuals: Array  # (k, N) along the normals of the local planes, length_unit
     normals: Array  # (N, 3) unit, at the points
@@ -343,10 +343,11 @@ class _Quadrics(NamedTuple):
 def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices) -> _Quadrics:
     """Return quadrics fitted to the k neighbours of each of N points.
 
-    In axes x, y across the normal the height over the plane is a constant plus c·(x, y, x², √2·xy, y²). Least squares
-    with a small penalty: c = (S + μW)⁻¹q, and once more for the residuals (iterated Tikhonov), with μ `_NOT_SHOWN`. S
-    is the normal matrix of the terms less their means; W is that of the terms as they are, without products of first
-    and second order. So a coefficient that the neighbours hardly determine stays near zero, whatever the axes.
+    With x and y across the normal the height over the local plane is a constant plus c·(x, y, x², √2·xy, y²). The
+    coefficients c are found by least squares with a small penalty, in two rounds (iterated Tikhonov): (S + μW) c = q,
+    and once more for the residuals, with μ `_NOT_SHOWN` and q the products of terms and heights. S is the normal matrix
+    of the terms less their means; W is that of the terms as they are, without products of first and second order. So a
+    coefficient that the neighbours hardly determine stays near zero, whatever the axes.
 
     Args:
         points: (M, 3) all points.
@@ -354,15 +355,13 @@ def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices)
         normals: (N, 3) unit normals of the local planes.
         index: (N, k) indices of each centre's neighbours among all points.
     """
-    local = np.array([column[index.T] for column in points.T]) - centres.T[:, None]
     n = normals.T
-    a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]]))
-    # A point without a normal (zero) has no axes either: division by zero is avoided.
-    a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
-    b = _cross(n, a)
-    x, y, heights = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
-    scale = np.sqrt(np.maximum((x * x + y * y).max(axis=0), 1e-300))
-    x, y = x / scale, y / scale
+    a, b = _axes_across(n)
+    neighbours = np.array([column[index.T] for column in points.T]) - centres.T[:, None]
+    x, y, heights = (np.einsum("in,ikn->kn", axis, neighbours) for axis in (a, b, n))
+    # In units of the farthest neighbour's distance.
+    size = np.sqrt(np.maximum((x * x + y * y).max(axis=0), 1e-300))
+    x, y = x / size, y / size
     terms = np.array([x, y, x * x, np.sqrt(2) * x * y, y * y])
     penalty = _NOT_SHOWN * _orders_apart(_normal_matrices(terms))
     terms -= terms.mean(axis=1, keepdims=True)
@@ -373,9 +372,18 @@ def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices)
         coefficients = _cholesky_solve(factors, np.einsum("ikn,kn->in", terms, residuals))
         residuals -= np.einsum("ikn,in->kn", terms, coefficients)
         slope += coefficients[:2]
-    slope /= scale
+    slope /= size
+    # The normal of the surface z = slope · (x, y) at the point itself.
     bent = n - slope[0] * a - slope[1] * b
     return _Quadrics(residuals, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, penalty, factors)
+
+
+def _axes_across(normals: Array) -> tuple[Array, Array]:
+    """Return unit vectors (3, N) and (3, N) across normals (3, N) and each other; zero where a normal is."""
+    other = np.where(np.abs(normals[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]])
+    a = _cross(normals, other)
+    a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+    return a, _cross(normals, a)
 
 
 def _orders_apart(W: Array) -> Array:

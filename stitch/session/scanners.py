@@ -14,7 +14,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.kernels import same_stop
-from stitch.session.session import Scanner, SessionData, View
+from stitch.session.session import SessionData
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,6 @@ def stops_of(session: SessionData) -> Indices:
     for number, stop in enumerate(stops):
         stop_of_view[stop] = number
     return stop_of_view
-
-
-def scanner_of(session: SessionData, view: View) -> Scanner:
-    """Return the scanner of a view."""
-    return session.parts[view.scanner].scanner if session.parts else session.scanner
 
 
 def have_own_hand_eyes(sessions: Sequence[SessionData]) -> bool:

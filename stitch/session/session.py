@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array, Indices, Mask
@@ -65,14 +64,6 @@ class WholeCloud:
         if len(cloud.points) != self.count or not np.array_equal(bounding_box(cloud.points), self.box):
             raise InputError(f"the scan of view {self.scan.name} changed on disk during the run; to fix: run again")
         return cloud
-
-
-@dataclass(frozen=True)
-class RangeImage:
-    """One scan pixel by pixel, H rows and W columns; lengths in length_unit."""
-
-    points: Array  # (H, W, 3) scanner frame; NaN where nothing was measured
-    grey: NDArray[np.uint8]  # (H, W)
 
 
 @dataclass(frozen=True)

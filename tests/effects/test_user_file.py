@@ -15,7 +15,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.session import public_session
 from stitch.effects import EFFECTS, effect, twist, user_file
 from stitch.effects.user_file import load
-from stitch.effects.user_source import FILE, source_of
+from stitch.effects.user_source import EFFECTS_FILE, source_of
 from stitch.errors import InputError
 from stitch.output.run_folder import lock_run_folder
 
@@ -87,7 +87,7 @@ def test_an_error_in_an_effect_of_ones_own_is_one_line(tmp_path):
     assert "\n" not in str(error.value)
 
 
-EFFECTS_FILE = """
+TEMPLATE = """
 import sys
 import numpy as np
 from stitch.effects import effect, number
@@ -103,7 +103,7 @@ def of_my_own(points, view, k):
 def own_effect(tmp_path):
     def make(body="return points", place="sensor", typical="0.02", limit="1.0"):
         file = tmp_path / "mine.py"
-        file.write_text(EFFECTS_FILE.format(body=body, place=place, typical=typical, limit=limit))
+        file.write_text(TEMPLATE.format(body=body, place=place, typical=typical, limit=limit))
         load(file)
         return EFFECTS["of_my_own"].function
 
@@ -192,7 +192,7 @@ def test_a_run_with_an_effect_of_a_script_is_read_again(ran, own, tmp_path):
     with pytest.raises(InputError, match="--trust"):
         stitch.load_run(saved)
     again = stitch.load_run(saved, trust=True)
-    assert EFFECTS["of_a_script"].origin == str(saved / FILE)
+    assert EFFECTS["of_a_script"].origin == str(saved / EFFECTS_FILE)
     assert (again.T_mount == ran.T_mount).all() and again.terms[0].values == pytest.approx(ran.terms[0].values)
     views = again.measurement.views
     np.testing.assert_allclose(
@@ -202,13 +202,13 @@ def test_a_run_with_an_effect_of_a_script_is_read_again(ran, own, tmp_path):
     with lock_run_folder(saved):
         again.save(saved, recording=False)
     elsewhere = again.save(tmp_path / "copy", recording=False)
-    assert (elsewhere / FILE).read_text() == (saved / FILE).read_text()
+    assert (elsewhere / EFFECTS_FILE).read_text() == (saved / EFFECTS_FILE).read_text()
     assert stitch.load_run(elsewhere, trust=True).effects == ["of_a_script"]
 
 
 def test_a_run_without_such_an_effect_has_no_file_beside_it(ran, tmp_path):
     saved = stitch.drop(ran, "of_a_script").save(tmp_path / "run", recording=False)
-    assert not (saved / FILE).exists() and "effects_file" not in (saved / "model.toml").read_text()
+    assert not (saved / EFFECTS_FILE).exists() and "effects_file" not in (saved / "model.toml").read_text()
 
 
 @pytest.mark.parametrize(

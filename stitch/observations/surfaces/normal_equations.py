@@ -82,7 +82,7 @@ def collect_overlaps(
     capture: Capture,
     poses: Array,
     gate: float,
-    samples: Sequence[Indices],
+    samples: Sequence[Indices] | None = None,
     before: Overlaps | None = None,
 ) -> Overlaps:
     """Return the correspondences of all overlapping pairs of views, and of common targets, with their normal equations.
@@ -90,13 +90,15 @@ def collect_overlaps(
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         gate: largest distance between corresponding points, length_unit.
-        samples: per view the numbers of the points that are searched in other views.
+        samples: per view the numbers of the points that are searched in other views; None: `FINE_SAMPLES` of each.
         before: of an earlier iteration. Its pairs, and the nearest points that cannot have changed, are used again
             while the views have moved little; None: all is searched.
 
     Raises:
         NoResultError: no two views overlap.
     """
+    if samples is None:
+        samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
         pairs, strides = before.pairs, before.strides
         probed, searched = before.probed, before.searched

@@ -296,29 +296,37 @@ class SmoothErrorLikelihood:
         return np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
     def error_moments(self, cause: int, shares: Array) -> tuple[Array, Array, float]:
-        """Return mean (K_c,) and second moment (K_c, K_c) of the errors f of one cause, over the noise, and its degrees
-        of freedom: those of a variance are twice its square over its own variance (JCGM 100, G.4).
+        """Return posterior mean (K_c,) and second moment E[ffᵀ] (K_c, K_c) of the errors f of one cause, and degrees of
+        freedom: how well E[|f|²] is known. Errors are in units of the scanner's noise.
 
-        The size s of the errors is integrated over its posterior, the other causes having shares (C,):
-        E[ffᵀ] = ∫ p(s) (f̂f̂ᵀ + C) ds, with C = (A + 1/s²)⁻¹, f̂ = C b and p(s) ∝ |1 + s²A|^(−1/2) exp(½ bᵀf̂) π(s), for
-        A = TᵀB⁻¹T and b = TᵀB⁻¹d of data d with covariance B but for the errors T f (Box and Tiao 1973, 5.2).
+        How large the errors are nobody knows, so that their size s, one sigma, is integrated over its posterior p(s).
+        Data d = T f + rest, the rest of covariance B. Given s, f is normal with covariance C = (A + 1/s²)⁻¹ and mean
+        f̂ = C b, where A = TᵀB⁻¹T and b = TᵀB⁻¹d; p(s) ∝ |1 + s²A|^(−1/2) exp(½ bᵀf̂) π(s) (Box and Tiao 1973, 5.2).
+        The prior π is log-normal about `USUAL_SHARE`. A variance has twice its square over its own variance as degrees
+        of freedom (JCGM 100, G.4).
+
+        Args:
+            cause: number of the cause in `design`.
+            shares: (C,) sizes of all causes over the noise; that of `cause` itself does not count.
         """
+        T = self.design[cause]
         others = np.where(np.arange(len(shares)) == cause, 0.0, shares)
-        solved = np.linalg.solve(self._data_covariance(others), self.design[cause])
-        # Independent of each other along the eigenvectors of A.
-        information, axes = np.linalg.eigh(self.design[cause].T @ solved)
-        pull = axes.T @ (solved.T @ self.data)
-        squares = USUAL_SHARE**2 * np.exp(2 * SHARE_SPREAD * _SIZE_SIGMAS)[:, None]
-        growth = 1 + squares * np.maximum(information, 0.0)
-        variance = squares / growth
-        mean = variance * pull
-        log_posterior = -0.5 * (np.log(growth).sum(axis=1) - mean @ pull + _SIZE_SIGMAS**2)
+        solved = np.linalg.solve(self._data_covariance(others), T)
+        # Along the eigenvectors of A the errors are independent of each other: what follows is one row a size s.
+        A, axes = np.linalg.eigh(T.T @ solved)
+        b = axes.T @ (solved.T @ self.data)
+        square_sizes = USUAL_SHARE**2 * np.exp(2 * SHARE_SPREAD * _SIZE_SIGMAS)[:, None]
+        growth = 1 + square_sizes * np.maximum(A, 0.0)
+        variance = square_sizes / growth
+        mean = variance * b
+        log_posterior = -0.5 * (np.log(growth).sum(axis=1) - mean @ b + _SIZE_SIGMAS**2)
         weights = np.exp(log_posterior - log_posterior.max())
         weights /= weights.sum()
         moment = (mean.T * weights) @ mean + np.diag(weights @ variance)
         total = (mean**2 + variance).sum(axis=1)
-        scatter = max(float(weights @ (total - weights @ total) ** 2), 1e-300)
-        return axes @ (weights @ mean), axes @ moment @ axes.T, float(2 * (weights @ total) ** 2 / scatter)
+        variance_of_total = max(float(weights @ (total - weights @ total) ** 2), 1e-300)
+        degrees = float(2 * (weights @ total) ** 2 / variance_of_total)
+        return axes @ (weights @ mean), axes @ moment @ axes.T, degrees
 
     def ml_shares(self, limits: Mapping[int, float] | None = None) -> tuple[Array, float]:
         """Return the shares (C,) of maximum likelihood, and −2 log likelihood there.
@@ -398,22 +406,43 @@ def view_error_likelihood(
     Shared shapes are the same in all views. Those per view are the same in the views of one part of the session: up to
     `_MAX_PARTS` parts follow each other in time, of fewer views each is a part.
 
-    The normal equations M f = vector of all parameters f are Σ w g gᵀ and Σ w g e over the pairs of views, less what
-    motions of the views can absorb.
-
     Args:
         sums: of `sum_smooth_errors` with per_view=True.
         noise: of the scanner along the ray, length_unit.
         nuisance: number of the last parameters of the sums, which may have any size.
     """
     g = unconstrained.overlaps.gram
+    parts = int(part_of_view(g.views)[-1]) + 1
+    M, vector = _part_equations(sums, g)
+    # The parameters are COARSE shapes of each part, one over incidence, further shapes of all views, then the nuisance.
+    K = len(M) - nuisance
+    per_part, incidence, further = np.split(np.eye(K), [COARSE * parts, COARSE * parts + 1], axis=1)
+    # A coarse shape that all views share is the same coefficient in every part.
+    coarse = per_part @ np.tile(np.eye(COARSE), (parts, 1))
+    causes = (np.hstack([coarse, further]), incidence, per_part)
+    return _likelihood_of(M, vector, causes, g, noise, nuisance, threshold=_NORMAL_NOISE)
+
+
+def part_of_view(views: int) -> Indices:
+    """Return the part (V,) of the session to which a view belongs."""
+    return np.arange(views) * min(views, _MAX_PARTS) // views
+
+
+def _part_equations(sums: PointGram, g: Gram) -> tuple[Array, Array]:
+    """Return the normal equations M f = vector, (K, K) and (K,), of smooth errors f of parts of a session.
+
+    They are Σ w g gᵀ and Σ w g e over the pairs of views, less what motions of the views absorb. The parameters f are
+    COARSE shapes of the first part, of the second and so on, then those that all views share.
+
+    Args:
+        sums: of `sum_smooth_errors` with per_view=True: COARSE columns for the first view of a pair, as many for the
+            second, then those that all views share.
+    """
     part = part_of_view(g.views)
-    parts = int(part[-1]) + 1
-    # The parameters are COARSE shapes of each part, then those that all views share. Per pair (P, columns), `parameter`
-    # says which of them each column of its sums stands for.
     of_parts = [COARSE * part[view][:, None] + np.arange(COARSE) for view in g.pairs.astype(np.int64).T]
-    common = COARSE * parts + np.arange(sums.residual.shape[1] - 2 * COARSE)
-    parameter = np.hstack([*of_parts, np.broadcast_to(common, (len(g.pairs), len(common)))])
+    shared = COARSE * (part[-1] + 1) + np.arange(sums.residual.shape[1] - 2 * COARSE)
+    # (P, columns) the number of the parameter that each column of the sums of a pair stands for.
+    parameter = np.hstack([*of_parts, np.broadcast_to(shared, (len(g.pairs), len(shared)))])
     count = int(parameter.max()) + 1
     M, vector = np.zeros((count, count)), np.zeros(count)
     np.add.at(M, (parameter[:, :, None], parameter[:, None, :]), sums.square)
@@ -423,15 +452,7 @@ def view_error_likelihood(
     M -= on_views.T @ solve_view_sums(g, by_surfaces, by_targets)
     # The iteration ended a small step short of where the views agree best.
     vector += on_views.T @ visible_step(g).ravel()
-    # Which parameters an error of each cause changes: a shared coarse shape is the same coefficient in every part.
-    per_part, incidence, shared = np.split(np.eye(count - nuisance), [COARSE * parts, COARSE * parts + 1], axis=1)
-    causes = (np.hstack([per_part @ np.tile(np.eye(COARSE), (parts, 1)), shared]), incidence, per_part)
-    return _likelihood_of(M, vector, causes, g, noise, nuisance, threshold=_NORMAL_NOISE)
-
-
-def part_of_view(views: int) -> Indices:
-    """Return the part (V,) of the session to which a view belongs."""
-    return np.arange(views) * min(views, _MAX_PARTS) // views
+    return M, vector
 
 
 def _sum_on_views(sums: PointGram, g: Gram, parameter: Indices, keep: Mask, count: int) -> Array:
@@ -456,7 +477,7 @@ def _likelihood_of(
     causes: Sequence[Array],
     g: Gram,
     noise: float,
-    nuisance: int = 0,
+    nuisance: int,
     threshold: float = _ROUNDING_SHARE,
 ) -> SmoothErrorLikelihood:
     """Return the likelihood of sizes of errors f from the normal equations M f = vector, in the eigenvectors of M.

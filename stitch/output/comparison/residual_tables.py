@@ -22,8 +22,8 @@ from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import BlockLeastSquares
 from stitch.numerics.units import covariate_unit
-from stitch.observations.surfaces.matching import Match, sample_points
-from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
+from stitch.observations.surfaces.matching import Match
+from stitch.observations.surfaces.normal_equations import RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
 from stitch.output.schema import Document, Key
 from stitch.run_data import RunData
@@ -203,8 +203,7 @@ def compare_surfaces(state: RunData) -> ResidualTables:
     with library_threads_off():
         capture = corrected_capture(state.measurement, state.model)
         poses = capture.poses(state.model.T_mount)
-        samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
-        overlaps = collect_overlaps(capture, poses, state.gate, samples)
+        overlaps = collect_overlaps(capture, poses, state.gate)
     rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
     known = view_properties(state.measurement.views)

@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch.effects.axis_effects import PLACEMENT
 from stitch.errors import InputError
-from stitch.model.model import COVERAGE_FACTOR, numbers_covariance, uncertainty_scope
+from stitch.model.model import COVERAGE_FACTOR, uncertainty_scope
 from stitch.model.model_toml import ModelFile, read_model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -23,6 +23,8 @@ from stitch.plugins.intake.controllers.taught_points import NUMBERS, fixed_xyz_n
 from stitch.session.axes import Axis
 from stitch.system.packages import stitch_version
 
+# Of a twist, for central differences: far above rounding, far below the bend of any angle.
+_STEP = 1e-6
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
 _PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
 # Characters that a frame's name may have in every format: those of a link in URDF and of a name in YAML.
@@ -59,7 +61,7 @@ class ExportedHandEye:
             labels: their names, (n,).
             units: their units, (n,).
         """
-        sigma = np.sqrt(np.diag(numbers_covariance(numbers, self.T_mount, self.covariance)))
+        sigma = np.sqrt(np.diag(_numbers_covariance(numbers, self.T_mount, self.covariance)))
         sizes = zip(labels, COVERAGE_FACTOR * sigma, units, strict=True)
         U = [f"{label} {size:.2g} {unit}".rstrip() for label, size, unit in sizes]
         return [
@@ -74,6 +76,19 @@ class ExportedHandEye:
         T = self.T_mount.copy()
         T[:3, 3] /= METRES[unit]
         return T
+
+
+def _numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
+    """Return the covariance (n, n) of the numbers by which a controller states a hand-eye, to first order.
+
+    Args:
+        numbers: function of a pose (4, 4) that returns those numbers (n,), continuous near T_mount.
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    steps = _STEP * np.eye(6)
+    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
+    return np.transpose(J) @ covariance @ np.array(J)
 
 
 def hand_eye_of_run(

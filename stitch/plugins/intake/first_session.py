@@ -52,6 +52,7 @@ from stitch.plugins.intake.readings import (
     with_uncoupled_joints,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change, state
+from stitch.plugins.intake.scan_headers import poses_in_scans
 from stitch.plugins.intake.scan_targets import find_folder_targets, target_motions
 from stitch.plugins.intake.session_guesses import session_guesses
 from stitch.plugins.intake.stated_folder import StatedFolder
@@ -62,7 +63,6 @@ from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES
-from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
 from stitch.session.thinning import distinct_points, thin_session
 from stitch.system.process import steps

@@ -17,12 +17,13 @@ from stitch.errors import InputError
 from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory, with_chosen
 from stitch.plugins.intake.raw_poses import ARRAYS, RawPoses, read_by_its_program, read_lists, read_raw_poses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
+from stitch.plugins.intake.scan_headers import poses_in_scans
+from stitch.plugins.intake.table_files import WORKBOOKS
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.session.reading.intrinsics import Intrinsics, find_intrinsics
 from stitch.session.reading.scan_files import ptx_scans, read_text_columns
-from stitch.session.reading.scan_headers import poses_in_scans
-from stitch.session.reading.text_files import WORKBOOKS, readable
+from stitch.session.reading.text_files import readable
 from stitch.system.packages import import_extra
 
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.

@@ -50,9 +50,9 @@ from stitch.plugins.intake.session_draft import (
     write_texts,
 )
 from stitch.plugins.intake.stated_folder import StatedFolder
+from stitch.plugins.intake.table_files import WORKBOOKS
 from stitch.session.capture import Capture, build_capture, sightings_of
 from stitch.session.reading.session_toml import SESSION_FORMAT
-from stitch.session.reading.text_files import WORKBOOKS
 from stitch.session.session import Mount, Sighting, View
 
 # Time about that of a pose within which a target's rows count, s.

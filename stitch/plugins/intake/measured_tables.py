@@ -18,8 +18,8 @@ from stitch.plugins.intake.pose_tables import parse_number_table
 from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, read_raw_poses
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, all_readings, with_joints_of
 from stitch.plugins.intake.stated_folder import StatedFolder
+from stitch.plugins.intake.table_files import WORKBOOKS, read_any_text, workbook_sheets
 from stitch.session.reading.robot_description import robot_from_dh
-from stitch.session.reading.text_files import WORKBOOKS, read_any_text, workbook_sheets
 from stitch.session.robot import Robot
 
 _ROBOT = re.compile(r"robot|flange|tcp|joint|\barm\b|kuka|abb|fanuc|nominal|command|program", re.IGNORECASE)

@@ -25,9 +25,9 @@ from stitch.plugins.intake.pose_tables import (
     repeated_records,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change
-from stitch.session.reading.announced_points import require_array_room
-from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
-from stitch.session.reading.text_files import WORKBOOKS, read_any_text, reason_of, require_file, workbook_sheets
+from stitch.plugins.intake.scan_headers import poses_in_scans, times_in_scans
+from stitch.plugins.intake.table_files import WORKBOOKS, read_any_text, require_array_room, workbook_sheets
+from stitch.session.reading.text_files import reason_of, require_file
 from stitch.session.reading.yaml_file import parse_yaml
 
 ARRAYS = (".npy", ".npz", ".mat")

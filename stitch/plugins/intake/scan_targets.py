@@ -12,11 +12,11 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.plugins.intake.detection.balls import ball_sightings
 from stitch.plugins.intake.detection.boards import Board, PlacedBoard, board_sightings, boards_in
+from stitch.plugins.intake.detection.range_image import read_range_image
 from stitch.plugins.intake.folder_files import FolderFiles
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import MM
 from stitch.screening.motions import RelativeScans
-from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_toml import read_session_document
 from stitch.session.reading.views_table import read_views
 from stitch.session.session import Cloud, SessionData, Sighting

@@ -1,14 +1,10 @@
-"""How many points a scan's header announces, asked before a library makes room for them: LAS, E57, EXR, HDF5; and how
-large the arrays of MATLAB and NumPy and the sheets of a workbook are that are to hold poses.
+"""How many points a scan's header announces, asked before a library makes room for them: LAS, E57, EXR, HDF5.
 
 Layouts: LAS 1.4 R15 (ASPRS), tables 3 and 4; ASTM E2807, clause 6; OpenEXR, "The OpenEXR file layout".
 """
 
 import re
 import struct
-import zipfile
-import zlib
-from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import InputError
@@ -26,12 +22,6 @@ _E57_XML = 24  # where the XML stands, how long it is, and the size of a page
 _E57_CHECKSUM = 4  # bytes at the end of a page
 # The description stands before the pixels; texts in it are short.
 _EXR_HEADER = 1 << 20
-# Poses of a million views.
-_MOST_BYTES = 200_000_000
-_MAT_HEADER, _MAT_PACKED = 128, 15
-# A sheet is read as a rectangle up to its last filled cell; 20 columns for a million rows.
-_MOST_CELLS = 20_000_000
-_FILLED_CELL = re.compile(rb"<(?:\w+:)?c\s(?:[^>]*?\s)?r=[\"']([A-Z]{1,3})(\d{1,7})[\"'][^>]*(?<!/)>")
 _EXR_WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
 
 
@@ -101,84 +91,3 @@ def require_exr_room(path: Path) -> None:
         require_room(path, max(right - left + 1, 0) * max(bottom - top + 1, 0))
     if not windows:
         raise InputError(f"{path}: has no dataWindow where the description of an OpenEXR stands; export it again")
-
-
-def require_array_room(path: Path) -> None:
-    """Refuse a .mat or .npz whose arrays are larger than any table of poses, before memory is allocated for them.
-
-    Other files, and damaged ones, are left to their reader.
-
-    Raises:
-        InputError: names the bytes that are announced.
-    """
-    count = {".mat": _mat_bytes, ".npz": _zip_bytes}.get(path.suffix.lower())
-    if count is not None and (announced := count(path)) > _MOST_BYTES:
-        raise InputError(f"{path}: {announced} bytes of arrays announced; to fix: save the poses alone")
-
-
-def require_workbook_room(path: Path) -> None:
-    """Refuse a workbook whose sheets are larger than any table of poses, before memory is allocated for them.
-
-    One number in the last cell of an empty sheet makes 17 billion cells: a reader would be ended by the system. What
-    is no ZIP archive is left to its reader.
-
-    Raises:
-        InputError: names the bytes, or the cells, that are announced.
-    """
-    if (unpacked := _zip_bytes(path)) > _MOST_BYTES:
-        raise InputError(f"{path}: {unpacked} bytes of sheets announced; to fix: save the poses alone, as CSV")
-    # A damaged archive is left to its reader too.
-    with suppress(zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, zlib.error, EOFError):
-        with zipfile.ZipFile(path) as archive:
-            sheets = [name for name in archive.namelist() if name.startswith("xl/worksheets/")]
-            cells = max((_cells(archive.read(name)) for name in sheets), default=0)
-        if cells > _MOST_CELLS:
-            raise InputError(f"{path}: {cells} cells up to the last filled one; to fix: save the poses alone, as CSV")
-
-
-def _cells(sheet: bytes) -> int:
-    """Return the number of cells from A1 to the last filled row and column of a sheet, bytes of Office Open XML."""
-    letters = set[bytes]()
-    rows = 0
-    for cell in _FILLED_CELL.finditer(sheet):
-        letters.add(cell[1])
-        rows = max(rows, int(cell[2]))
-    return rows * max((_column(name) for name in letters), default=0)
-
-
-def _column(letters: bytes) -> int:
-    """The number of a column: A is 1, AA is 27."""
-    return sum((letter - ord("A") + 1) * 26**place for place, letter in enumerate(reversed(letters)))
-
-
-def _mat_bytes(path: Path) -> int:
-    """Return the bytes that the elements of a MAT-file of version 5 unpack to; 0 for any other file.
-
-    Each element begins with a tag of type and size. A compressed one holds another such tag, of its unpacked data.
-    """
-    total, size = 0, path.stat().st_size
-    with path.open("rb") as stream:
-        head = stream.read(_MAT_HEADER)  # its last two bytes tell the byte order
-        order = ">" if head[126:] == b"MI" else "<"
-        if head[126:] not in (b"MI", b"IM"):
-            return 0
-        while len(tag := stream.read(8)) == 8:
-            kind, count = struct.unpack(f"{order}II", tag)
-            after = stream.tell() + count
-            if kind == _MAT_PACKED:
-                try:
-                    _, unpacked = struct.unpack(f"{order}II", zlib.decompressobj().decompress(stream.read(64), 8))
-                except (zlib.error, struct.error):
-                    return total
-                total += unpacked
-            stream.seek(min(after, size))
-    return max(total, size)
-
-
-def _zip_bytes(path: Path) -> int:
-    """Return how many bytes the files of a ZIP archive unpack to, as it says; 0 where it is none."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return sum(entry.file_size for entry in archive.infolist())
-    except (zipfile.BadZipFile, OSError):
-        return 0

@@ -9,13 +9,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
+from stitch.session.axes import Axis
 from stitch.session.axis_poses import place_stated_axes, require_placed
 from stitch.session.moving_scanner import deskew_session
 from stitch.session.reading.clouds import read_cloud
@@ -74,22 +75,17 @@ def load_session(
     document = read_session_document(file)
     unit = table_choice(file, document, "length_unit", tuple(METRES))
     mount = table_choice(file, document, "mount", get_args(Mount))
+    cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
     robot = read_robot(file, document.get("robot"), unit)
-    tables = document.get("axis", [])
-    has_poses = not tables or has_pose_columns(read_csv_rows(path / "views.csv")[0])
-    axes = read_axes(file, tables, mount, has_poses)
+    scanner = read_scanner(file, document.get("scanner", {}))
+    axes, has_poses = _read_axes(file, document.get("axis", []), mount)
     rows = read_views(path / "views.csv", robot, axes, unit) if start is None else [row_at(file, robot, start)]
     rows = [row for row in rows if only is None or row.view.name == only]
-    cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
-    scanner = read_scanner(file, document.get("scanner", {}))
-    # How a moving scanner moved is found from all points of its scans, where there is room for them.
-    at_most = None if scanner.moving else at_most
-    if memory is not None:
-        at_most = min(at_most or MAX_POINTS, points_within(memory, len(rows)))
     within = read_crop_box(file, document.get("scanner", {}))
     views = [row.view for row in rows]
     if scans:
-        clouds = read_scans(path, rows, unit, cloud_unit, scanner, within=within, at_most=at_most)
+        in_memory = _points_in_memory(at_most, memory, len(rows), scanner)
+        clouds = read_scans(path, rows, unit, cloud_unit, scanner, within=within, at_most=in_memory)
         views = _measured_views(path, rows, clouds)
     cad, cad_unit = cad_file(file, document.get("part", {}))
     session = SessionData(
@@ -115,6 +111,25 @@ def load_session(
         check_scale(session, cloud_unit)
     # One view alone says nothing of how the robot moved.
     return deskew_session(session) if scanner.moving and scans and only is None else session
+
+
+def _read_axes(file: Path, tables: Any, mount: str) -> tuple[tuple[Axis, ...], bool]:
+    """Return the external axes of [[axis]], and whether a robot moves beside them: views.csv has poses or joints.
+
+    Args:
+        file: session.toml; views.csv lies beside it.
+        tables: entry `axis` of the document.
+        mount: eye_to_hand or eye_in_hand.
+    """
+    has_poses = not tables or has_pose_columns(read_csv_rows(file.with_name("views.csv"))[0])
+    return read_axes(file, tables, mount, has_poses), has_poses
+
+
+def _points_in_memory(at_most: int | None, memory: float | None, views: int, scanner: Scanner) -> int | None:
+    """Return how many points of a view stay in memory; None: all. Arguments as of `load_session`."""
+    # How a moving scanner moved is found from all points of its scans, where there is room for them.
+    most = None if scanner.moving else at_most
+    return most if memory is None else min(most or MAX_POINTS, points_within(memory, views))
 
 
 def _read_sightings(path: Path, known: Collection[str]) -> dict[str, Sighting]:

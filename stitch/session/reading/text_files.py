@@ -4,18 +4,14 @@ What it holds as TOML, JSON or sheets; names that people write there; and values
 """
 
 import codecs
-import csv
-import io
 import json
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from stitch.errors import InputError
-from stitch.session.reading.announced_points import require_workbook_room
-from stitch.system.packages import import_extra
 
 # Tables and descriptions are far smaller; a larger one is another file.
 LARGEST_MB = 200
@@ -23,8 +19,7 @@ LARGEST_MB = 200
 _LARGEST_TOML_MB = 20
 # How the small file begins that Git LFS leaves in place of a large one.
 _POINTER = b"version https://git-lfs"
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-WORKBOOKS = (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
+UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 # What every run of one session holds.
 _DOCUMENTS = ("model.toml", "result.json", "ledger.json")
 _SESSION = "session.toml"
@@ -44,37 +39,14 @@ def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
     Raises:
         InputError: no such file, too large, or not UTF-8.
     """
-    _require_size(file, hint, largest_mb)
+    require_size(file, hint, largest_mb)
     try:
         return file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(not_utf8(file, "UTF-8")) from None
 
 
-def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
-    """Return the text of a file of another program, in UTF-8, UTF-16 with its byte order mark, or else Windows-1252.
-
-    Spreadsheets write the last two. A wrong guess changes only letters in names: digits are the same in all.
-
-    Args:
-        hint: what to do where there is no such file.
-        largest_mb: MB; larger files are refused.
-
-    Raises:
-        InputError: no such file, too large, or no text.
-    """
-    _require_size(file, hint, largest_mb)
-    content = file.read_bytes()
-    marked = content.startswith(_UTF16)
-    for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            text = content.decode(encoding)
-            if "\0" not in text:
-                return text
-    raise InputError(f"{file}: is no text; to fix: save it as UTF-8")
-
-
-def _require_size(file: Path, hint: str, largest_mb: float) -> None:
+def require_size(file: Path, hint: str, largest_mb: float) -> None:
     """Refuse a file that cannot be read, or that is larger than so many MB.
 
     Args:
@@ -173,7 +145,7 @@ def not_utf8(file: Path, save_as: str) -> str:
     """
     content = file.read_bytes()
     mend = f"to fix: save it as {save_as}"
-    if content.startswith(_UTF16):
+    if content.startswith(UTF16):
         return f"{file} line 1: is UTF-16 text, not UTF-8; {mend}"
     try:
         content.decode("utf-8-sig")
@@ -236,29 +208,6 @@ def read_json_object(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
-
-
-def workbook_sheets(file: Path) -> dict[str, str]:
-    """Return sheet name -> its content as CSV, of the sheets of a workbook that are not empty.
-
-    Raises:
-        InputError: no such file, no workbook, one that is too large, or the package that reads them is missing.
-    """
-    require_file(file, "name a workbook")
-    require_workbook_room(file)
-    calamine = import_extra("python_calamine", file, "formats")
-    try:
-        book = calamine.CalamineWorkbook.from_path(str(file))
-        sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
-    except (calamine.CalamineError, OSError, ValueError) as error:
-        raise InputError(f"{file}: no readable workbook ({reason_of(error)}); to fix: save its sheets as CSV") from None
-    texts = {}
-    for name, rows in sheets.items():
-        if rows:
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(rows)
-            texts[name] = text.getvalue()
-    return texts
 
 
 def require_name(where: str, name: str, what: str) -> str:

@@ -175,17 +175,6 @@ def row_at(file: Path, robot: Robot | None, joints: Array) -> ViewRow:
     return ViewRow(0, "", View("start", None, forward(robot, joints), joints, still, time_s=None, covariates={}))
 
 
-def has_reported_poses(file: Path) -> bool:
-    """Return True if some row of a views.csv has a pose; False where there is no such file.
-
-    The table must have been checked before: here nothing is.
-    """
-    if not file.is_file():
-        return False
-    header, rows = read_csv_rows(file)
-    return any(row[name] for _, row in rows for name in POSE_COLUMNS if name in header)
-
-
 def _check_header(file: Path, header: Sequence[str], robot: Robot | None, has_axes: bool = False) -> int:
     """Check the names of the columns of views.csv; return the number of joint columns, 0 without any.
 

@@ -28,9 +28,9 @@ from stitch.numerics import frames
 from stitch.numerics.units import METRES
 from stitch.plugins.intake.detection.balls import ViewBalls, ball_sightings, find_balls, label_balls
 from stitch.plugins.intake.detection.boards import board_sightings, boards_in, lift_points, parse_board
+from stitch.plugins.intake.detection.range_image import RangeImage
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
-from stitch.session.session import RangeImage
 from tests.command_line import ended
 
 cv2 = pytest.importorskip("cv2")

@@ -19,8 +19,8 @@ from stitch.plugins.intake.pose_tables import parse_number_table
 from stitch.plugins.intake.raw_poses import read_raw_poses
 from stitch.plugins.intake.session_draft import write_draft
 from stitch.plugins.intake.stated_folder import StatedFolder
+from stitch.plugins.intake.table_files import read_any_text
 from stitch.session.reading.session_folder import load_session
-from stitch.session.reading.text_files import read_any_text
 
 ROWS = [[111.5, -331.25, 317.0, -2.5, 0.125, 3.0], [114.0, -358.5, 360.75, -2.75, 0.25, -3.0]]
 

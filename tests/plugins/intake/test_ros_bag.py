@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.plugins.intake.detection.range_image import read_range_image
 from stitch.plugins.intake.ros_bag import TransformTree, find_bag, write_bag_session
-from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_folder import load_session
 from tests.command_line import ended
 

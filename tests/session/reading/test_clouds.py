@@ -14,11 +14,11 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
+from stitch.plugins.intake.detection.range_image import read_range_image
 from stitch.plugins.intake.first_session import first_session
+from stitch.plugins.intake.scan_headers import poses_in_scans, times_in_scans
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.clouds import cloud_of_columns, read_cloud
-from stitch.session.reading.range_image import read_range_image
-from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from tests.needs import needs
 
 POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100

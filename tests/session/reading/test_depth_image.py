@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from stitch.errors import InputError
+from stitch.plugins.intake.detection.range_image import read_range_image
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.range_image import read_range_image
 from tests.needs import needs
 
 cv2 = pytest.importorskip("cv2")

@@ -13,7 +13,8 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import MAD_TO_SIGMA
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Mask
-from stitch.session.session import RangeImage, Sighting
+from stitch.plugins.intake.detection.range_image import RangeImage
+from stitch.session.session import Sighting
 
 _FORMS = (
     "charuco:11x8:20:15:DICT_4X4_50 (squares, their side and that of the markers in mm, OpenCV's dictionary), "

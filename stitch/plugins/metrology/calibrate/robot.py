@@ -31,8 +31,9 @@ from stitch.output.session_files import dh_rows, robot_toml
 from stitch.output.urdf_file import to_urdf
 from stitch.run_data import RunData
 from stitch.session.axis_poses import reported_poses
+from stitch.session.reading.csv_files import read_csv_rows
 from stitch.session.reading.robot_description import robot_from_dh, robot_from_urdf
-from stitch.session.reading.views_table import has_reported_poses
+from stitch.session.reading.views_table import POSE_COLUMNS
 from stitch.session.robot import Robot, elementary, forward
 from stitch.session.session import SessionData, View
 
@@ -343,7 +344,7 @@ def robot_notes(table: LinkTable, run: RunData) -> list[str]:
         each = [f"j{i + 1} {a:.0f} … {b:.0f}°" for i, (a, b) in enumerate(np.degrees(table.ranges))]
         notes.append(f"Proved for {', '.join(each)}; beyond, nothing was measured.")
     notes.append(beyond_sentence(run.terms, table.effects))
-    if table.effects and session.robot is not None and has_reported_poses(session.path / "views.csv"):
+    if table.effects and session.robot is not None and _has_reported_poses(session.path / "views.csv"):
         views = zip(reported_poses(session), session.views, strict=True)
         poses = [(T, view.joints) for T, view in views if view.joints is not None]
         off = max(float(np.linalg.norm((T - forward(session.robot, q))[:3, 3])) for T, q in poses)
@@ -352,6 +353,14 @@ def robot_notes(table: LinkTable, run: RunData) -> list[str]:
             f"{length_text(off, session.length_unit, 2)}), and where they stand they are used and no table is."
         )
     return notes
+
+
+def _has_reported_poses(file: Path) -> bool:
+    """Return True if some row of a views.csv, checked before, has a pose; False where there is no such file."""
+    if not file.is_file():
+        return False
+    header, rows = read_csv_rows(file)
+    return any(row[name] for _, row in rows for name in POSE_COLUMNS if name in header)
 
 
 def robot_document(

@@ -1,6 +1,7 @@
 """Scans as images: organised clouds with brightness or colour, and depth images with the colour image beside them."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, r
 from stitch.session.reading.pcd_file import read_pcd
 from stitch.session.reading.scan_files import grid_shape, read_ply, read_zdf_image
 from stitch.session.reading.text_files import reason_of
-from stitch.session.session import RangeImage
 from stitch.system import ply_file
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -21,6 +21,14 @@ _RGB = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_gree
 _GREY = ("intensity", "grey", "gray", "brightness", "reflectance")
 # Share of pixels that may be brighter than the white of an intensity in counts.
 _SATURATED = 0.5
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """One scan pixel by pixel, H rows and W columns; lengths in length_unit."""
+
+    points: Array  # (H, W, 3) scanner frame; NaN where nothing was measured
+    grey: NDArray[np.uint8]  # (H, W)
 
 
 def read_range_image(path: Path, scale: float = 1.0) -> RangeImage | None:
