@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -115,10 +116,11 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
     def joined(name: str) -> Array:
         return np.concatenate([getattr(views, name), getattr(more, name)])
 
-    in_all = ("joints", "previous", "approach", "time", "number", "T_base_flange")
+    names = ("joints", "previous", "approach", "time", "number", "T_base_flange")
+    of_both: dict[str, Any] = {name: joined(name) for name in names}
     every = replace(
         views,
-        **{name: joined(name) for name in in_all},
+        **of_both,
         count=views.count + more.count,
         velocity=None if views.velocity is None else joined("velocity"),
         torques=views.torques.followed_by(more.torques),
