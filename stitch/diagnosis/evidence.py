@@ -153,9 +153,10 @@ def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     least = next(r.log_posterior for r in evidence.ranked if r.name == named.name) - limits.ODDS
     rivals = dict[str, Ranked]()
     for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]:
-        has_event = any(p.discrete for e in (r, named) for p in e.score.candidate.parameters)
         is_refused = any(r.name in note for note in evidence.notes)
-        if r.name != named.name and is_contender(r) and not is_refused and (r.log_posterior > least or not has_event):
+        if r.name == named.name or is_refused or not is_contender(r):
+            continue
+        if r.log_posterior > least or not any(p.discrete for e in (r, named) for p in e.score.candidate.parameters):
             rivals[r.name] = r
     validations = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
     left_out = dict(evidence.left_out) | validations
