@@ -167,7 +167,7 @@ def test_what_the_numbers_do_not_hold_is_said(tmp_path):
         (None, "whether an effect is missing has not been asked"),
         ("adequate", "no effect is found missing"),
         ("missing_effect", "too small until the effect is added"),
-        ("unknown_effect", "too small: something without a name is missing"),
+        ("unknown_effect", "hold for a complete model, and something without a name is missing"),
     ],
 )
 def test_an_uncertainty_says_of_which_model_it_is(verdict, said, tmp_path):
