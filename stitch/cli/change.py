@@ -270,9 +270,9 @@ def remarks(result: RunData) -> list[str]:
         if term.sigmas_from_zero < FAINT_SIGMAS:
             lines.append(
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "
-                "zero by two sigmas."
+                "zero by two sigmas, their number counted."
                 if term.name in helpful
-                else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
+                else f"{term.name}: no parameter differs from zero by two sigmas, their number counted; it can be dropped."
             )
     return lines
 

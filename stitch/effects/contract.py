@@ -48,7 +48,7 @@ _WHERE_FROM = {
     "moment": "joint angles and the robot's geometry",
     "temperature": "a column such as robot_temperature_c or ambient_c in views.csv",
     "velocity": "columns j1_velocity_deg_s … in views.csv",
-    "time": "a column time_s in views.csv",
+    "time": "a column time_s in views.csv that rises",
     "intensity": "an intensity for every point",
     "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
     "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
