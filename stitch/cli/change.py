@@ -272,7 +272,7 @@ def remarks(result: RunData) -> list[str]:
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "
                 "zero by two sigmas, their number counted."
                 if term.name in helpful
-                else f"{term.name}: no parameter differs from zero by two sigmas, their number counted; it can be dropped."
+                else f"{term.name}: of its parameters none is two sigmas from zero, their number counted: drop it."
             )
     return lines
 
