@@ -447,16 +447,6 @@ def thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPose
     """
     # Rounded up.
     every = -(-sum(len(m.residual) for m in unconstrained.overlaps.matches) // _MAX_CORRESPONDENCES) or 1
-    thinned = [
-        replace(
-            m,
-            middle=m.middle[::every],
-            normal=m.normal[::every],
-            residual=m.residual[::every],
-            weight=every * m.weight[::every],
-            index_v=m.index_v[::every],
-            index_w=m.index_w[::every],
-        )
-        for m in unconstrained.overlaps.matches
-    ]
+    some = [m.subset(slice(None, None, every)) for m in unconstrained.overlaps.matches]
+    thinned = [replace(m, weight=every * m.weight) for m in some]
     return replace(unconstrained, overlaps=replace(unconstrained.overlaps, matches=thinned))
