@@ -60,8 +60,8 @@ def new_cell(folder: Path, seed: int) -> list[float]:
     return np.degrees(plan.joints[0]).tolist()
 
 
-def take(folder: Path, view: str, joints: Array, seed: int) -> None:
-    """Take one view and write its scan, then its row, into the session."""
+def take(folder: Path, view: str, joints: Array, seed: int) -> bool:
+    """Take one view and write its scan, then its row, into the session; return False where the scanner sees nothing."""
     scene = driven_scene()
     names, before = _rows(folder)
     every = np.array([*before, joints])
@@ -74,6 +74,8 @@ def take(folder: Path, view: str, joints: Array, seed: int) -> None:
     moment = moments_of(scene, plan, 30.0 * np.arange(len(every)), still_air)[-1]
     cell = Cell(scene, part_mesh(scene), laws, true_mount(scene, seed), weights, {})
     cloud = take_view(cell, moment, 0.0, np.random.default_rng([seed, 5, len(names)])).cloud
+    if not len(cloud.points):
+        return False
     (folder / "clouds").mkdir(exist_ok=True)
     write_ply(folder / "clouds" / f"{view}.ply", cloud_file(cloud))
     table = folder / "views.csv"
@@ -81,6 +83,7 @@ def take(folder: Path, view: str, joints: Array, seed: int) -> None:
         if not names:
             file.write(",".join(["view", "cloud", "time_s", *(f"j{i + 1}_deg" for i in range(len(joints)))]) + "\r\n")
         csv.writer(file).writerow([view, f"clouds/{view}.ply", 30.0 * len(names), *np.degrees(joints)])
+    return True
 
 
 def _rows(folder: Path) -> tuple[list[str], list[Array]]:
@@ -104,8 +107,7 @@ def main(seed: int, faults: list[str]) -> int:
             return int(fault == "fail")
     if "far" in faults and before and abs(joints[0] - before[0][0]) > _SHORT:
         return 3
-    take(folder, pose["view"], joints, seed)
-    return 0
+    return 0 if take(folder, pose["view"], joints, seed) else 3
 
 
 if __name__ == "__main__":
