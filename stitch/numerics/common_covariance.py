@@ -149,12 +149,17 @@ class CommonCovariance:
         return [columns.of(part, 0) for part in self._cached(columns.whole)]
 
     def cache(self, wholes: Sequence[Array]) -> None:
-        """Cache the turned numbers of sets of columns (n, P): all in one product, since many small ones take longer."""
+        """Cache the turned numbers of several sets of columns (n, P), all of one product: many small ones take longer.
+
+        A single set is turned when it is first asked for, and one whose products are cached needs it no more. Sets are
+        known by their ids, which stay theirs since the cache holds the arrays.
+        """
         new = [
             whole for whole in wholes if id(whole) not in self._turned and (id(whole), id(whole)) not in self._products
         ]
         if len(new) > 1:
             ends = np.cumsum([whole.shape[1] for whole in new])[:-1]
+            # Turned columns come first: (p, r, n).
             parts = [np.split(part, ends) for part in self._turn(np.hstack(new))]
             for whole, *turned in zip(new, *parts, strict=True):
                 self._cached(whole, turned)
@@ -234,7 +239,10 @@ class MeanSums:
         return [np.concatenate(parts) for parts in zip(*map(self.common.turned, self.sets), strict=True)]
 
     def products_with_further(self, sets: Sequence[SelectedColumns]) -> Array:
-        """Return products (t, a + g + 1, a + g + 1) of all columns per pair, g further ones between the mean's and z.
+        """Return products (t, a + g + 1, a + g + 1) of all columns: a of the mean, g further ones, and z.
+
+        Each is summed over blocks for one of the t pairs i ≤ j of turned numbers; weighted by the pairs' entries of V⁻¹
+        (`PairWeights.pairs`) they add up to [X z]ᵀV⁻¹[X z].
 
         Args:
             sets: further columns, g in all.

@@ -305,8 +305,10 @@ def _hold_against_others(
 ) -> _Case | None:
     """Return the case of one view against the others: their normal equations, the robot's prior, noise and scatter.
 
-    The other views are moved by their overlaps alone, without this view, and their scatter is estimated. None where
-    fewer than `_FEWEST_VIEWS` others are left; the nearest `_MOST_VIEWS` count.
+    The other views are moved by their overlaps alone, without this view, and their scatter is estimated. The case is
+    linear about these poses, and that of the robot for the view; it numbers the views among the nearest `_MOST_VIEWS`,
+    which count. In its prior `held` the robot says where all views are, in `free` where the others are. None where
+    fewer than `_FEWEST_VIEWS` others are left.
 
     Args:
         T_mount: (4, 4) hand-eye to begin with.
@@ -338,10 +340,11 @@ def _hold_against_others(
     twists[rows] = unconstrained.twists.ravel()
     start = np.array(poses)
     start[others] = unconstrained.poses
-    mean = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
+    # What a correction of the hand-eye does to all views stays free.
+    of_hand_eye = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
     precision = prior_precision(capture, Repeatability(rotation, translation, factor), g.centre)
-    held = with_free_mean(precision, mean)
-    precision[view] = 0.0
+    without_view = precision.copy()
+    without_view[view] = 0.0
     return _Case(
         capture,
         view,
@@ -350,8 +353,8 @@ def _hold_against_others(
         H,
         b,
         twists,
-        held,
-        free=with_free_mean(precision, mean),
+        held=with_free_mean(precision, of_hand_eye),
+        free=with_free_mean(without_view, of_hand_eye),
         gate=unconstrained.overlaps.gate,
         sigma=g.scale,
         factor=factor,

@@ -78,7 +78,7 @@ class FieldError:
     rms_by_view: float  # of errors that every view has for itself
     gain: float  # log likelihood ratio, nats, of the clearer of both against the largest size that every scanner has
     over_noise: bool  # one of the two is larger than the scanner's noise
-    by_view: bool = False  # those by view are the clearer
+    by_view: bool = False  # those by view are the clearer, or the only ones
     with_time: bool = False  # those by view have a trend over the session
     map: FieldMap | None = field(default=None, compare=False, repr=False)  # where those of all views are the clearer
 
@@ -121,7 +121,8 @@ def field_error(
     if per_view_is_clearer:
         shared = _cause_size(by_causes, SHARED, alpha / 2)
     else:
-        # COARSE shapes over the field, one over incidence, and the nuisance effects; finer shapes are left out.
+        # The sums hold COARSE shapes of the first view of a pair and those of the second, which are one and the same
+        # here; then incidence, finer shapes, which are left out, and the nuisance effects.
         together = sums.merge_sides(per_view=COARSE)
         column = np.arange(together.residual.shape[1])
         coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
