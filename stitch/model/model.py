@@ -198,6 +198,10 @@ class Model(Value):
 
         Args:
             names: effect.parameter of each of the P parameters.
+
+        Example:
+            >>> run.model.covariance_with([]).shape
+            (6, 6)
         """
         known = self.effects_covariance
         covariance = np.zeros((6 + len(names), 6 + len(names)))

@@ -246,7 +246,7 @@ def test_a_part_that_moves_is_followed_from_scan_to_scan_and_where_it_is_gone_it
         ("fit", "fit.toml", '"pane.stl"', '"none.stl"', "none.stl: not found"),
         ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; to fix: write a number above zero"),
         ("fit", "fit.toml", "high = [700.0", "high = [10.0", "the box region[1] is empty"),
-        ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; to fix: write 'nominal'"),
+        ("fit", "fit.toml", "[nominal]\n", "[nominl]\n", "unknown key 'nominl'; to fix: write 'nominal'"),
         ("seam", "seam.toml", "[part]", "[other]", "unknown key 'other'"),
         ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
     ],
