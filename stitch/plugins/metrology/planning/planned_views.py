@@ -17,6 +17,8 @@ from stitch.session.session import SessionData, View
 _SHARE = 0.4
 # So many times as many poses are tried as are asked for.
 _TRIES = 4
+# Times at the most that random poses are drawn, until there are a sixth of those that are asked for.
+_SEARCHES = 6
 
 
 def with_views(session: SessionData, joints: Sequence[Array], in_turn: bool = True) -> SessionData:
@@ -63,7 +65,13 @@ def candidate_joints(session: SessionData, cell: CellModel, count: int, chosen: 
         return build_capture(session.name, (), T, session.mount).poses(T_mount)
 
     seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
-    joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen)
     least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
-    seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
-    return joints[: _TRIES * count][list(seen)][:count]
+    possible = np.zeros((0, driven.shape[1]))
+    for seed in range(_SEARCHES):
+        # About a single view the part is hardly ever in its place again: random angles are drawn anew then.
+        joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen, seed)[: _TRIES * count]
+        seen = [len(index) >= least for index in expected_scans(cell, poses_of(joints))]
+        possible = np.concatenate([possible, joints[seen]])
+        if _SEARCHES * len(possible) >= count:
+            break
+    return possible[:count]
