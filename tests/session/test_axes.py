@@ -81,6 +81,16 @@ def test_a_session_with_a_table_is_saved_and_read_with_reported_poses(tmp_path):
     assert again.axes[0].is_fixed and np.allclose(axes_of(again).readings[:, 0], cell.readings[:, 0])
 
 
+def test_axes_alone_that_meet_at_the_origin_of_the_base_are_no_wrong_unit(tmp_path):
+    cell = axis_cell("tilt-turn", 5, views=4, pixels=40)
+    tables = [
+        {"direction": cell.stated(axis)[0].tolist(), "point": [0.0, 0.0, 5.0 * k]} for k, axis in enumerate(cell.axes)
+    ]
+    write_cell(tmp_path / "s", cell, tables)
+    session = stitch.load_session(tmp_path / "s")
+    assert max(np.linalg.norm(view.T_base_flange[:3, 3]) for view in session.views) < 30
+
+
 def test_arrays_with_an_axis_are_the_session_of_a_folder(tmp_path):
     cell = axis_cell("turntable", 5, views=4, pixels=40)
     direction, point = cell.in_scanner(cell.axes[0])
