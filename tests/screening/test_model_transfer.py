@@ -117,6 +117,8 @@ def test_targets_seen_once_need_the_model_of_another_run(cell):
     known = run(once, model=model)
     assert not known.doubts and 0.005 < known.residual_rms < 0.2
     assert "seen in one view alone" not in run_verdict(known, None)
+    light, doubted = run_light(known, None, 10.0), run_light(replace(known, doubts=("A doubt.",)), None, 10.0)
+    assert light.light == "good" and doubted.light == "check" and light.sentence in doubted.sentence
 
 
 def test_targets_nobody_knows_and_one_view_alone_shows_are_placed_without_a_verdict(cell):

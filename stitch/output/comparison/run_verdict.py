@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
 from stitch.output.comparison.model_history import ModelHistory, ModelStep, effect_changes
 from stitch.run_data import RunData, doubt_headline
@@ -19,7 +20,7 @@ Light = Literal["good", "check", "bad"]
 class ToleranceVerdict(NamedTuple):
     """How the views agree against a tolerance."""
 
-    light: Light  # good: model and stitched cloud; check: the stitched cloud alone; bad: neither
+    light: Light  # good: model and stitched cloud; check: the stitched cloud alone, or in doubt; bad: neither
     sentence: str
 
 
@@ -123,14 +124,24 @@ def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> T
     unit = run.session.length_unit
     if history is not None:
         found = check_tolerance(history, tolerance, unit)
-        if not run.doubts or found.light == "bad":
-            return found
-        return ToleranceVerdict("check", f"In doubt, though views agree. {found.sentence}")
-    if run.targets is None or run.targets.uninformative:
+    elif run.targets is not None and not run.targets.uninformative:
+        found = _check_targets(run.targets.distances, tolerance, unit)
+    else:
         return None
-    reach = float(np.nanquantile(run.targets.distances, 0.95))
-    targets = f"95 % of what was seen of the targets lies within {length_text(reach, unit)} of their place"
-    sentence = f"{length_text(tolerance, unit, 4)}: {targets} under the model."
+    if not run.doubts or found.light == "bad":
+        return found
+    return ToleranceVerdict("check", f"In doubt, though views agree. {found.sentence}")
+
+
+def _check_targets(distances: Array, tolerance: float, length_unit: str) -> ToleranceVerdict:
+    """Return whether 95 % of the sightings of targets lie within a tolerance of their place: "good" or "bad".
+
+    Args:
+        distances: of the sightings from the places of their targets, NaN where there is none; length_unit.
+    """
+    reach = float(np.nanquantile(distances, 0.95))
+    targets = f"95 % of what was seen of the targets lies within {length_text(reach, length_unit)} of their place"
+    sentence = f"{length_text(tolerance, length_unit, 4)}: {targets} under the model."
     if reach > tolerance:
         return ToleranceVerdict("bad", f"Not within {sentence}")
     return ToleranceVerdict("good", f"Within {sentence}")
