@@ -405,11 +405,13 @@ class UsualEffects:
         of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
         for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
             errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)
-        by_place = self.by_place(thin_correspondences(unconstrained))
-        # A base that tilts follows the arm's pose as its joints do: one size for both.
-        arm = [by_place.pop(place) for place in ("robot", "base") if place in by_place]
-        for place, columns in (by_place | ({"robot": np.hstack(arm)} if arm else {})).items():
-            errors = errors.with_component(place, columns @ columns.T, 1.0)
+        covariances = dict[str, Array]()
+        for place, columns in self.by_place(thin_correspondences(unconstrained)).items():
+            # A base that tilts follows the arm's pose as its joints do: one size for both.
+            cause = "robot" if place == "base" else place
+            covariances[cause] = covariances.get(cause, 0.0) + columns @ columns.T
+        for cause, covariance in covariances.items():
+            errors = errors.with_component(cause, covariance, 1.0)
         return errors
 
     def by_place(self, unconstrained: UnconstrainedPoses, without: Collection[str] = ()) -> dict[str, Array]:
