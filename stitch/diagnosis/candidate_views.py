@@ -19,6 +19,8 @@ _SAMPLES = 6000
 _SPREAD = np.radians(40.0)  # about joint angles that were driven before
 _CLOSER = np.radians(20.0)  # about views that were chosen among those
 _LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they were beyond already
+# Times at the most that random angles are drawn, until there are enough to try.
+_SEARCHES = 6
 # A view may see the part by this share of its distance farther off than any before, and turned by so much.
 _MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
@@ -68,6 +70,20 @@ def reachable(
     # A view direction far from all others would share no surface with them.
     inside &= (poses[:, :3, 2] @ seen_from[:, :3, 2].T).max(axis=1) > _TURNED
     return joints[inside]
+
+
+def drawn_until(draw: Callable[[int], Array], enough: float) -> Array:
+    """Return joint angles (K, n), rad, of as many draws as are needed for so many of them, `_SEARCHES` at the most.
+
+    Args:
+        draw: called with a seed; returns the possible ones among its random joint angles (k, n).
+    """
+    drawn = list[Array]()
+    for seed in range(_SEARCHES):
+        drawn.append(draw(seed))
+        if sum(map(len, drawn)) >= enough:
+            break
+    return np.concatenate(drawn)
 
 
 def candidate_measurement(measurement: Measurement, joints: Array, wait: Array | float = 0.0) -> Measurement:

@@ -18,7 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stitch.diagnosis.candidate_views import candidate_measurement, candidate_rows, nearby, reachable, with_candidates
+from stitch.diagnosis.candidate_views import (
+    candidate_measurement,
+    candidate_rows,
+    drawn_until,
+    nearby,
+    reachable,
+    with_candidates,
+)
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.thresholds import ODDS
@@ -53,8 +60,6 @@ from stitch.system.threads import remembered
 
 # Poses that are tried; then the best of them again, with so many poses close to those.
 _TRIED, _BEST, _CLOSE_TO_BEST = 72, 3, 24
-# Times at the most that random poses are drawn, until there are enough to try.
-_SEARCHES = 6
 # Points of the scans of which it is asked whether a pose sees them, the least share of what the views see, and the
 # least cosine at which a surface is seen.
 _POINTS, _LEAST_SEEN, _FACING = 300, 0.5, 0.2
@@ -341,14 +346,13 @@ def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
 
     scan_poses = observation.capture.poses(T_mount)
     least = _LEAST_SEEN * np.median(seen_shares(observation, scan_poses, scan_poses))
-    possible = np.zeros((0, driven.shape[1]))
-    for seed in range(_SEARCHES):
+
+    def seeing(seed: int) -> Array:
+        """Return random joint angles (k, n) from which the scanner sees the part."""
         joints = reachable(driven, poses_of, scan_poses, observation.centre, chosen, seed)
-        joints = joints[seen_shares(observation, scan_poses, poses_of(joints)) > least] if len(joints) else joints
-        possible = np.concatenate([possible, joints])
-        if len(possible) >= _TRIED:
-            break
-    return possible
+        return joints[seen_shares(observation, scan_poses, poses_of(joints)) > least] if len(joints) else joints
+
+    return drawn_until(seeing, _TRIED)
 
 
 def seen_shares(observation: SurfaceObservation, scan_poses: Array, poses: Array) -> Array:

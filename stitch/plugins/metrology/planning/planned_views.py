@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.diagnosis.candidate_views import reachable
+from stitch.diagnosis.candidate_views import drawn_until, reachable
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.planning.expected_model import FEWEST, CellModel, expected_scans
 from stitch.session.axis_poses import carried_last
@@ -17,8 +17,8 @@ from stitch.session.session import SessionData, View
 _SHARE = 0.4
 # So many times as many poses are tried as are asked for.
 _TRIES = 4
-# Times at the most that random poses are drawn, until there are a sixth of those that are asked for.
-_SEARCHES = 6
+# More poses are drawn until there are this share of those that are asked for.
+_ENOUGH = 1 / 6
 
 
 def with_views(session: SessionData, joints: Sequence[Array], in_turn: bool = True) -> SessionData:
@@ -66,12 +66,11 @@ def candidate_joints(session: SessionData, cell: CellModel, count: int, chosen: 
 
     seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
     least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
-    possible = np.zeros((0, driven.shape[1]))
-    for seed in range(_SEARCHES):
-        # About a single view the part is hardly ever in its place again: random angles are drawn anew then.
+
+    def seeing(seed: int) -> Array:
+        """Return random joint angles (k, n) in which the scanner would see enough of the part."""
         joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen, seed)[: _TRIES * count]
-        seen = [len(index) >= least for index in expected_scans(cell, poses_of(joints))]
-        possible = np.concatenate([possible, joints[seen]])
-        if _SEARCHES * len(possible) >= count:
-            break
-    return possible[:count]
+        return joints[[len(index) >= least for index in expected_scans(cell, poses_of(joints))]]
+
+    # About a single view the part is hardly ever in its place again: random angles are drawn anew then.
+    return drawn_until(seeing, _ENOUGH * count)[:count]
