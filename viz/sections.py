@@ -110,7 +110,7 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
         for row in rows
     ]
     others = effects_tried(found) - len(screen["candidates"])
-    titles = {"adequate": "Tried beside the model", "unknown_effect": "No known effect explains it"}
+    titles = {"adequate": "Tried beside the model", "unknown_effect": "Tried, and none named"}
     return {
         "title": titles.get(found.verdict, "What is missing?"),
         "bars": bars,

@@ -278,7 +278,7 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
                 follows = f": the error follows joint {diagnosis.curves[0].joint}"
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
-            return f"Something is missing that no known effect explains{follows}."
+            return f"Something is missing, and {why_without_a_name(diagnosis)}{follows}."
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
     if diagnosis.verdict == "cannot_tell":
         return _rivals(named, trends, unnamed_in_words(diagnosis))
