@@ -6,10 +6,11 @@ find the true hand-eye within twice its U, and to say of what it cannot know tha
 what it asks for is done to the letter, and it is asked again. Right: the views meet under the true hand-eye (cases), or
 poses, mount and pairing are those of the campaign.
 
-CONVENTIONS: conventions scrambled on purpose, of the five objects of RegHEC, nine views each. Twelve orders of Euler
-angles × poses inverted or not, 24 tables an object; axes that turn along or stand still, degrees or radians, mm or m,
-angles or positions first are drawn for each. Right: order, direction, unit and mount as they were; wrong: told, but
-otherwise than they were.
+DRAWN: 300 folders of a seed, formats × layouts × conventions × units × names × mistakes, of
+data_synth/fixtures/drawn_folders.py. Each is asked without guessing; where a question comes back, a person who knows
+the cell answers it, one answer a time, by the data that the refusal carries. Right: every view that belongs there has
+the pose, the unit and the mount of the campaign, and no other is there; or nothing can be right, and the refusal names
+the true cause. A guess is marked if it bears "?"; a session that is wrong in what bears no mark is silently so.
 """
 
 import io
@@ -31,35 +32,27 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from bench.harness import SHARED_CASES, SHARED_DATA, Row, Table, grouped, markdown, with_all
+from bench.harness import SHARED_CASES, Row, Table, grouped, markdown, share
 from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.drawn_folders import MM, Truth, draw_folder
 from data_synth.fixtures.field_folders import KINDS, Campaign, Kind
-from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from data_synth.write import write_session
 from stitch.cli.main import main as stitch
+from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.urdf_file import to_urdf
-from stitch.plugins.intake.cloud_pairs import pairings
-from stitch.plugins.intake.convention_choice import choose_convention
-from stitch.plugins.intake.first_session import capture_of
-from stitch.plugins.intake.mounting import choose_mounting
-from stitch.plugins.intake.raw_poses import RawPoses
-from stitch.plugins.intake.readings import StatedTable, all_readings, candidate_units
-from stitch.screening.hypotheses import ORDERS
-from stitch.screening.motions import register_scan_pairs
-from stitch.session.reading.clouds import read_cloud
+from stitch.plugins.intake.guesses import Guess
+from stitch.plugins.intake.make_session import Made, make_session
+from stitch.plugins.intake.refusals import Refusal
 from stitch.session.reading.session_folder import load_session
 from stitch.session.session import SessionData
 
-OBJECTS = dict.fromkeys(("david", "cone", "sphere", "rubik"), "eye_in_hand") | {"gripperopen": "eye_to_hand"}
-OUTCOMES = ("right", "cannot be told", "wrong")
-MILLIMETRES = {"mm": 1.0, "m": 1e3}
 # The hand-eye behind the cases; under it the views of a right session lie this near to each other, mm.
 T_CASES = frames.make(Rotation.from_rotvec([0.080, -0.120, 0.750]).as_matrix(), np.array([62.0, -38.0, 95.0]))
 MEET_MM, _NEIGHBOURS = 0.25, 8
 # Of positions as tables round them; of the distance of clouds from the scanner, as a share.
-NEAR_MM, SIZE = 0.05, 5e-3
+NEAR_MM, NEAR_RAD, SIZE = 0.05, 5e-4, 5e-3
 # OpenGL's axes, and what a refusal has to say where it is right.
 OTHER_HAND_EYES = {"nerfstudio_transforms": np.diag([1.0, -1.0, -1.0, 1.0])}
 TRUE_CAUSES = {"tool_changed_midway": r"changed at scan_06\.ply, by \((-?0\.\d), (-?0\.\d), (149\.\d|150\.\d)\) mm"}
@@ -74,6 +67,8 @@ NO_HAND_EYE = (
 )
 NO_TRUE_HAND_EYE = (TURNTABLE, "bag_without_tf_static", "crash-steps-6-views", "duplicated-points")
 _SEED = 11
+# Answers that a person gives in turn; folders of one seed are written of so many campaigns.
+_STEPS, _CAMPAIGNS = 3, 3
 
 
 @dataclass
@@ -176,7 +171,7 @@ def run_verdict(name: str, out: Path) -> str:
     if done.code:
         return f"run refused: {done.refusal}"
     result = json.loads((folder / "result.json").read_text())
-    scale = np.repeat([1.0, MILLIMETRES[result["length_unit"]]], 3)
+    scale = np.repeat([1.0, MM[result["length_unit"]]], 3)
     T = np.array(result["hand_eye"])
     T[:3, 3] *= scale[3]
     sigma = np.array([np.nan if x is None else x for x in result["hand_eye_sigma"]]) * scale
@@ -192,7 +187,7 @@ def run_verdict(name: str, out: Path) -> str:
 
 def apart(session: SessionData, T_mount: Array) -> float:
     """Return the median distance (mm) of points from planes through their neighbours in the next view."""
-    scale = MILLIMETRES[session.length_unit]
+    scale = MM[session.length_unit]
     placed = []
     for view in session.views:
         T = np.array(view.T_base_flange)
@@ -277,7 +272,7 @@ def campaigns(seed: int) -> dict[str, Campaign]:
 def kind_verdict(kind: Kind, campaign: Campaign, out: Path) -> str:
     """Judge the session of a kind."""
     session = load_session(out)
-    scale = MILLIMETRES[session.length_unit]
+    scale = MM[session.length_unit]
     if kind.turntable:
         angles = np.degrees(np.unwrap(np.arctan2(campaign.T[:, 1, 0], campaign.T[:, 0, 0])))
         return "right" if len(session.views) == len(campaign.T) and turns(session, angles.tolist()) else "wrong"
@@ -310,70 +305,130 @@ CASES = Table(case_jobs, case_trial, folder_summary, range(1), page="own-data", 
 FIELD = Table(kind_jobs, kind_trial, folder_summary, range(1))
 
 
-def convention_jobs(seeds: range, views: int) -> Iterator[Row]:
-    """24 tables of every object, of the first so many of its nine views."""
-    for number, name in enumerate(OBJECTS):
-        for table in range(2 * len(ORDERS)):
-            yield {"object": name, "seed": seeds[0] + number, "table": table, "views": views}
+def drawn_jobs(seeds: range, count: int) -> Iterator[Row]:
+    """So many folders of each seed."""
+    yield from ({"seed": seed, "number": number} for seed in seeds for number in range(count))
 
 
-def convention_trial(job: Row) -> Row:
-    """Whether the convention of a table is told right, and what was said."""
-    convention = conventions(job["seed"])[job["table"]]
-    capture, T_true, clouds, motions = _scans(job["object"], job["views"])
-    numbers = np.round(table_of(T_true, convention), 7)
-    raw = RawPoses("table", None, numbers, ((),) * len(numbers), "")
-    readings = all_readings(raw, None, StatedTable())
-    pairs, units = pairings(clouds, raw.labels), candidate_units(readings, StatedTable())
-    decided = choose_convention(capture, motions, readings, pairs, units)
-    settled = choose_mounting(decided, None, None)
-    best = decided.best.interpretation
-    words = f"{best.reading.words}, {best.length_unit}, {settled.mount}{', inverted' * settled.inverted}"
-    following = decided.runner_up.misfit if decided.runner_up else 0
-    words += f" ({decided.best.misfit:.2f} mm, next {following:.2f})"
-    outcome = "cannot be told"
-    if decided.determined and settled.guess.determined:
-        T = settled.flange(best.T)
-        turned = frames.angle_between(T, T_true).max() < 1e-5
-        moved = np.abs(T - T_true)[:, :3, 3].max() < 0.01
-        outcome = "right" if turned and moved and settled.mount == OBJECTS[job["object"]] else "wrong"
-    return {"outcome": outcome, "convention": str(convention), "said": words}
+def drawn_trial(job: Row) -> Row:
+    """What becomes of a folder, asked and answered."""
+    drawn = draw_folder(job["seed"], job["number"])
+    campaign = campaigns(1000 * job["seed"] + job["number"] % _CAMPAIGNS)["arm"]
+    with TemporaryDirectory() as scratch:
+        folder, out = Path(scratch) / "scans", Path(scratch) / "session"
+        folder.mkdir()
+        truth = drawn.write(folder, campaign)
+        outcome, asked, told, guesses = answered(folder, out, truth, campaign.clouds)
+    usual = [guess.what for guess in guesses if guess.because == "usual"]
+    marked = sum(what in ("rotation", "pairing", "columns") for what in usual)
+    unmarked = len(guesses) - len(usual)
+    drawing = {"format": drawn.format, "mistake": drawn.mistake, "inverse": drawn.inverse}
+    drawing |= {"units": f"{drawn.unit}/{drawn.cloud_unit}", "named": drawn.named}
+    counts = {"marked": marked, "unmarked": unmarked}
+    return drawing | counts | {"outcome": outcome, "asked": asked, "told": told[:300]}
 
 
-@cache
-def _scans(name: str, views: int) -> tuple:
-    """The scans of an object, prepared once, its poses and files, and the motions between its scans: they are the same
-    under every table."""
-    folder = SHARED_DATA / "reghec" / name
-    T, names = session_poses(folder)
-    clouds = [folder / cloud for cloud in names[:views]]
-    capture = capture_of([read_cloud(cloud) for cloud in clouds], 1000.0)
-    return capture, T[:views], clouds, cache(lambda: register_scan_pairs(capture))
+def answered(
+    folder: Path, out: Path, truth: Truth, clouds: tuple[np.ndarray, ...]
+) -> tuple[str, list[str], str, tuple[Guess, ...]]:
+    """Return what becomes of a folder that is answered, what it asked, its last refusal, and the guesses."""
+    options: dict[str, str] = {}
+    asked: list[str] = []
+    told = ""
+    for _ in range(_STEPS):
+        try:
+            made = make_session(folder, out, options, guess=bool(asked), force=True)
+            return drawn_verdict(load_session(out), made, truth, clouds), asked, told, made.guesses
+        except InputError as refused:
+            told = refused.what.replace(str(folder), "scans")
+            answer = answer_of(refused, truth, options)
+        if answer is None:
+            known = truth.cause and re.search(truth.cause, told)
+            return "refused, true cause" if known else "refused", asked, told, ()
+        options |= answer
+        asked += answer
+    return "circle", asked, told, ()
 
 
-def conventions(seed: int) -> list[Convention]:
-    """Return one table for each order and direction, the rest drawn."""
-    rng = np.random.default_rng(seed)
-    out = []
-    for order in ORDERS:
-        for inverse in (False, True):
-            along, degrees, first = rng.integers(2, size=3).astype(bool)
-            unit = ("mm", "m")[rng.integers(2)]
-            order_told = order if along else order.lower()
-            out.append(Convention(order_told, bool(degrees), inverse=inverse, unit=unit, angles_first=bool(first)))
-    return out
+def answer_of(refused: InputError, truth: Truth, given: dict[str, str]) -> dict[str, str] | None:
+    """Return one answer of a person who knows the cell, of the options that a refusal carries; None where none is."""
+    for fix in refused.fixes if isinstance(refused, Refusal) else ():
+        for name, value in fix.options.items():
+            known = truth.answers.get(name)
+            if known is not None and given.get(name) != known and (value.isupper() or name != "rows"):
+                return {name: known}
+        if fix.options.keys() == {"poses"} and re.search(truth.answers.get("file", "$^"), fix.options["poses"]):
+            return dict(fix.options)
+    return None
 
 
-def convention_summary(rows: list[Row]) -> list[str]:
-    """A line an object."""
-    lines = []
-    for name, tables in with_all(grouped(rows, "object")).items():
-        counts = Counter(row["outcome"] for row in tables)
-        lines.append([name, *(f"{counts[o]} of {len(tables)}" for o in OUTCOMES)])
-    return markdown(" | ".join(["object", *OUTCOMES]), lines)
+def drawn_verdict(session: SessionData, made: Made, truth: Truth, clouds: tuple[np.ndarray, ...]) -> str:
+    """Judge a session by the campaign: right, or what is wrong and whether it bears a mark."""
+    marks = {guess.what for guess in made.guesses if guess.because == "usual"}
+    which = [truth.names.index(Path(view.name).name.split("clouds-")[-1]) for view in session.views]
+    T = np.array([view.T_base_flange for view in session.views])
+    T[:, :3, 3] *= MM[session.length_unit]
+    wrong: dict[str, tuple[str, ...]] = {}
+    if sorted(which) != list(truth.views):
+        wrong["views"] = ("pairing",)
+    if session.mount != "eye_in_hand":
+        wrong["mount"] = ("mount",)
+    size = [
+        np.median(np.linalg.norm(v.cloud.points, axis=1)) * MM[session.length_unit]
+        / np.median(np.linalg.norm(clouds[i], axis=1))
+        for i, v in zip(which, session.views, strict=True)
+    ]  # fmt: skip
+    if abs(np.median(size) - 1) > SIZE:
+        wrong["cloud unit"] = ("cloud_unit",)
+    elif np.abs(np.array(size) - 1).max() > SIZE:
+        wrong["one scan's unit"] = ()
+    p, true = T[:, :3, 3], truth.T[which][:, :3, 3]
+    scale = float(np.sum(p * true) / np.sum(true * true)) if "mount" not in wrong else 1.0
+    if abs(scale - 1) > SIZE:
+        wrong["unit"] = ("length_unit",)
+    turned = frames.angle_between(T, truth.T[which]).max()
+    if "mount" not in wrong and (turned > NEAR_RAD or np.abs(p - scale * true).max() > NEAR_MM * max(scale, 1)):
+        wrong["poses"] = ("rotation", "pairing", "columns")
+    if not wrong:
+        return "right"
+    silent = [what for what, guesses in wrong.items() if not marks & {*guesses}]
+    return f"silently wrong: {', '.join(silent)}" if silent else f"wrong as marked: {', '.join(wrong)}"
 
 
-CONVENTIONS = Table(
-    convention_jobs, convention_trial, convention_summary, range(1), page="conventions-told", block="scrambled",
-    settings={"views": 9},
-)  # fmt: skip
+def drawn_summary(rows: list[Row]) -> list[str]:
+    """Counts of what became of the folders, of all and by mistake."""
+    shown = [
+        (
+            "right, or refused with the true cause, after one answer at most",
+            lambda r: _is_fine(r) and len(r["asked"]) < 2,
+        ),
+        ("right without a question", lambda r: _is_fine(r) and not r["asked"]),
+        ("silently wrong", lambda r: r["outcome"].startswith("silently")),
+        ("wrong, and marked as a guess", lambda r: r["outcome"].startswith("wrong as")),
+        ("refused for another cause than the true one, or without a way on", lambda r: r["outcome"] == "refused"),
+        ("round in a circle", lambda r: r["outcome"] == "circle"),
+    ]
+    lines = [[words, share(holds(row) for row in rows)] for words, holds in shown]
+    silent = sum(row["outcome"].count(",") + 1 for row in rows if row["outcome"].startswith("silently"))
+    lines.append(["guesses without a mark that are wrong", f"{silent}/{sum(row['unmarked'] for row in rows)}"])
+    right = [row for row in rows if row["outcome"] == "right"]
+    lines.append(
+        ["right ones whose rotation, pairing and columns bear no mark", share(not row["marked"] for row in right)]
+    )
+    kinds = [
+        [mistake or "none", share(_is_fine(r) and len(r["asked"]) < 2 for r in group), _listed(group)]
+        for mistake, group in sorted(grouped(rows, "mistake").items())
+    ]
+    return [*markdown("of the folders | share", lines), "", *markdown("mistake | right | otherwise", kinds)]
+
+
+def _is_fine(row: Row) -> bool:
+    return row["outcome"] in ("right", "refused, true cause")
+
+
+def _listed(rows: list[Row]) -> str:
+    counts = Counter(row["outcome"] for row in rows if not _is_fine(row))
+    return ", ".join(f"{n} {outcome}" for outcome, n in counts.most_common())
+
+
+DRAWN = Table(drawn_jobs, drawn_trial, drawn_summary, range(1), page="own-data", block="drawn", settings={"count": 300})

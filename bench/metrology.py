@@ -3,8 +3,7 @@ of known truth, by a simulator that shares no code with the model.
 
 FEATURES: a clean cell; a compliance of the joints that is in the model; an arm that is a little wrong in every joint
 and link; a scanner with smooth errors over field and incidence, each half as large as its noise; one whose smooth
-errors are new in each scan. All have the small errors that every simulated cell has. SOURCES holds each part of the
-budget against what it truly does. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000
+errors are new in each scan. All have the small errors that every simulated cell has. Used up: 20000 to 20223, 30000
 to 30003, 40000 to 40203, 42000 to 42064, 43000 to 43119, 46000 to 46019, 46200 to 46239,
 46300 to 46339, 46400 to 46439.
 
@@ -25,7 +24,7 @@ import trimesh
 from scipy.stats import beta
 
 from bench.harness import Row, Table, markdown, share
-from data_synth import kinematics, nature
+from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.ordinary_arm import draw_arm
@@ -37,14 +36,12 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.result_document import model_of
-from stitch.plugins.metrology import error_sources as of
-from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, monte_carlo, number_table
-from stitch.plugins.metrology.error_sources import error_chain, place_errors
+from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features
+from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList
 from stitch.plugins.metrology.features import Feature
-from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
 from stitch.plugins.metrology.verification import Verification, verify
-from stitch.run_data import HandEyeTransfer, RunData
+from stitch.run_data import HandEyeTransfer
 
 NEW_IN_EACH = "smooth errors new in each scan"
 ARM_AND_NEW = f"ordinary arm, {NEW_IN_EACH}"
@@ -60,7 +57,6 @@ GROUPS = {
     "sphere z": "sphere centres",
     "distance distance": "distances",
 }
-PARTS = {"robot": (of.SCATTER, of.ARM, of.WANDERING, of.STOP, of.UNSEEN), "error over incidence": (of.INCIDENCE,)}
 PLATE = SpherePlate(radius=28.0)
 VIEWS, PIXELS, OVER_INCIDENCE = 8, 130, 0.2
 ARM = 0.3  # of an ordinary arm, in plausible sizes
@@ -79,28 +75,19 @@ def feature_jobs(seeds: range) -> Iterator[Row]:
 
 def feature_trial(job: Row) -> Row:
     """Numbers of a cell: the group of the feature, its U and its error."""
-    places, features, truth = _measured(job)
-    numbers = measure_features(places, features).numbers
+    kind = job["kind"]
+    # The same part in all cells, and a quarter of the simulation.
+    with patch("data_synth.simulate.part_mesh", lambda scene: _plate()):
+        measured = cell(kind, job["seed"])
+    state = run(session_of(measured), effects=("joint_compliance",) if kind == "effect in the model" else ())
+    features, truth = features_of(measured)
+    numbers = measure_features(place_errors(state), features).numbers
     errors = np.array([n.value for n in numbers]) - truth
     return {
         "numbers": [
             (GROUPS[f"{n.feature.kind} {n.quantity}"], n.U, e) for n, e in zip(numbers, errors.tolist(), strict=True)
         ]
     }
-
-
-def _measured(job: Row) -> tuple[PlaceErrors, FeatureList, Array]:
-    """Errors of places in a run of the cell, what is measured there, and its true numbers."""
-    state, measured = _run_of(job)
-    return place_errors(state), *features_of(measured)
-
-
-def _run_of(job: Row) -> tuple[RunData, Measured]:
-    kind = job["kind"]
-    # The same part in all cells, and a quarter of the simulation.
-    with patch("data_synth.simulate.part_mesh", lambda scene: _plate()):
-        measured = cell(kind, job["seed"])
-    return run(session_of(measured), effects=("joint_compliance",) if kind == "effect in the model" else ()), measured
 
 
 @cache
@@ -192,84 +179,6 @@ def covered_interval(seeds: Array, covered: Array) -> Array:
 
 
 FEATURES = Table(feature_jobs, feature_trial, feature_summary, range(47_000, 47_200), page="measure", block="coverage")
-
-
-def source_trial(job: Row) -> Row:
-    """Numbers of a cell: the group of the feature, and by part of the budget its variance and its true error.
-
-    True poses and the true error over incidence reach the numbers as their sources do; the rest is all else.
-    """
-    state, measured = _run_of(job)
-    places, (features, truth) = place_errors(state), features_of(measured)
-    result = measure_features(places, features)
-    by_model = measured.T_base_flange @ measured.T_mount
-    about = frames.make(np.eye(3), -places.centre)
-    apart = about @ measured.T_reference_scanner @ frames.inverse(about @ by_model)
-    of_robot = error_chain(state).of_poses(frames.log(apart).reshape(-1, 1))[0]
-    usual = next(source for source in places.sources if source.name == of.INCIDENCE)
-    size = OVER_INCIDENCE if job["kind"] == "smooth scanner errors" else nature.SMALL["incidence_bias"]
-    times = nature.LAWS["incidence_bias"].draw(size, None, np.random.default_rng(0))["b"] / usual.shapes[-1, 0]
-    known = (
-        ErrorSource("robot", of_robot, 0 * usual.shapes, 1.0),
-        replace(usual, views=times * usual.views, shapes=times * usual.shapes),
-    )
-    exact = replace(places, sources=known, scan_errors=None)
-    slopes = number_table(features.features, result.fits)[-1]
-    true = slopes @ np.vstack([exact.loadings(fit.at, fit.gradient) for fit in result.fits])
-    rows = []
-    for number, (robot, incidence), value in zip(result.numbers, true.tolist(), truth, strict=True):
-        shares = [sum(number.shares.get(name, 0.0) for name in names) for names in PARTS.values()]
-        variances = [number.u**2 * share for share in (*shares, 1 - sum(shares), 1.0)]
-        error = number.value - float(value)
-        errors = (robot, incidence, error - robot - incidence, error)
-        rows.append((GROUPS[f"{number.feature.kind} {number.quantity}"], variances, errors))
-    return {"numbers": rows}
-
-
-def source_summary(rows: list[Row]) -> list[str]:
-    """A line a feature: of each part its share of the variance, and U over twice its true spread with a 95 % interval
-    over cells, which are drawn again."""
-    rng = np.random.default_rng(0)
-    lines = []
-    for group in dict.fromkeys(GROUPS.values()):
-        of_cells = [[(v, e) for g, v, e in row["numbers"] if g == group] for row in rows]
-        variances, errors = np.moveaxis(np.array(of_cells), 2, 0)
-        squares = np.mean(errors**2 / variances, axis=1)
-        drawn = squares[rng.integers(len(rows), size=(4000, len(rows)))].mean(axis=1)
-        low, high = np.quantile(drawn**-0.5, [0.025, 0.975], axis=0)
-        share = 100 * np.mean(variances / variances[..., -1:], axis=(0, 1))
-        mean = squares.mean(axis=0) ** -0.5
-        cells = zip(mean, low, high, share, strict=True)
-        lines.append([group, *(f"{m:.2f} ({a:.2f} to {b:.2f}), {s:.0f} %" for m, a, b, s in cells)])
-    return markdown(" | ".join(["feature", *PARTS, "noise and smooth errors", "all"]), lines)
-
-
-SOURCES = Table(feature_jobs, source_trial, source_summary, range(46_200, 46_240), page="measure", block="sources")
-
-
-def trials_jobs(seeds: range, trials: int) -> Iterator[Row]:
-    """The same cells."""
-    yield from ({**job, "trials": trials} for job in feature_jobs(seeds))
-
-
-def trials_trial(job: Row) -> Row:
-    """Spread by Monte Carlo over that of propagation, of every number."""
-    places, features, _ = _measured(job)
-    fits = measure_features(places, features).fits
-    return {"ratios": monte_carlo(places, features, fits, job["trials"]).ratio.tolist()}
-
-
-def trials_summary(rows: list[Row]) -> list[str]:
-    """One sentence."""
-    ratios = np.concatenate([row["ratios"] for row in rows])
-    what = f"Monte Carlo ({rows[0]['trials']:,} trials) over propagation, {len(ratios)} numbers of {len(rows)} cells"
-    return [f"{what}: {ratios.min():.3f} to {ratios.max():.3f}."]
-
-
-MONTE_CARLO = Table(
-    trials_jobs, trials_trial, trials_summary, range(40_200, 40_204), page="measure", block="monte-carlo",
-    settings={"trials": 4000},
-)  # fmt: skip
 
 
 def certificate_jobs(seeds: range) -> Iterator[Row]:

@@ -189,7 +189,7 @@ def driven_trial(job: Row) -> Row:
         cell, told, ended, lost = DrivenCell(folder, size=_SIZE, start=start, most=_MOST), [], 0, False
         while ended <= len(job["faults"]):
             try:
-                drive(cell, _UNTIL, program, 20.0, lambda views, U: told.append((views, U)))
+                drive(cell, _UNTIL, program, 20.0, lambda views, U, _: told.append((views, U)))
                 break
             except NoResultError:
                 ended += 1

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from trimesh.registration import icp
 
 import stitch
-from bench.axes import points_off
+from bench.cells import points_off
 from bench.harness import Parts, Row, Table, markdown, share
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate

@@ -1,4 +1,4 @@
-"""How often a user is told the truth in cells of somebody who had not read the library: bench/outside_laws.py.
+"""How often a user is told the truth in cells of somebody who had not read the library: bench/outside_world.py.
 
 The cells of bench/outside_world.py go as folders through run, diagnose and add --suggested. Scoring is a function of
 the rows alone, by a table of what each effect of the library says of place and cause.
@@ -13,8 +13,7 @@ import numpy as np
 
 import stitch
 from bench.harness import Row, Table, grouped, markdown, share, with_all
-from bench.outside_laws import LAWS, NAMES
-from bench.outside_world import Array, build, hide, write
+from bench.outside_world import LAWS, NAMES, Array, build, hide, write
 from stitch.api.stepwise import suggest
 
 # What the library's effects say: the side of the arm or part of it that errs, and what the error follows.

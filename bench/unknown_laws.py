@@ -13,8 +13,8 @@ from functools import lru_cache, partial
 
 import numpy as np
 
+from bench.blind import LIBRARY, drawn, smallest
 from bench.harness import Row, Table, grouped, markdown, share
-from bench.small_cells import LIBRARY, drawn, smallest
 from data_synth import kinematics, nature
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import SMALL_SCENES, plan_for, small_scene

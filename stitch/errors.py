@@ -72,6 +72,10 @@ class ScaleError(InputError):
         self.views = views
 
 
+class NothingMeasuredError(InputError):
+    """A scan that shows nothing: no points, or none that count."""
+
+
 class BusyError(InputError):
     """Another process writes there: the same may do in a while."""
 

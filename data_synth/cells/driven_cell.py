@@ -2,8 +2,9 @@
 
     python -m data_synth.cells.driven_cell SEED [FAULT …]
 
-Faults, each once in a session: `fail` ends with an error, `hang` never answers, `lose` returns 0 and writes nothing;
-`far`, always: joint 1 goes no farther than a few degrees from where the first view was taken.
+Faults, each once in a session: `fail` ends with an error, `hang` never answers, `lose` returns 0 and writes nothing,
+`empty` returns 0 and writes a scan without points; `far`, always: joint 1 goes no farther than a few degrees from where
+the first view was taken.
 """
 
 import csv
@@ -28,10 +29,11 @@ from data_synth.write import cloud_file, robot_table
 from stitch.numerics import frames
 from stitch.output import session_files
 from stitch.output.session_files import SessionFiles, write_ply
+from stitch.session.session import Cloud
 
 Array = NDArray[np.float64]
 # Views after which a fault comes, and how far from home joint 1 goes where it is short, rad.
-_AFTER = {"fail": 2, "hang": 3, "lose": 5}
+_AFTER = {"fail": 2, "hang": 3, "empty": 4, "lose": 5}
 _SHORT = 0.25
 
 
@@ -60,8 +62,12 @@ def new_cell(folder: Path, seed: int) -> list[float]:
     return np.degrees(plan.joints[0]).tolist()
 
 
-def take(folder: Path, view: str, joints: Array, seed: int) -> bool:
-    """Take one view and write its scan, then its row, into the session; return False where the scanner sees nothing."""
+def take(folder: Path, view: str, joints: Array, seed: int, empty: bool = False) -> bool:
+    """Take one view and write its scan, then its row, into the session; return False where the scanner sees nothing.
+
+    Args:
+        empty: the scan is written without its points.
+    """
     scene = driven_scene()
     names, before = _rows(folder)
     every = np.array([*before, joints])
@@ -77,7 +83,7 @@ def take(folder: Path, view: str, joints: Array, seed: int) -> bool:
     if not len(cloud.points):
         return False
     (folder / "clouds").mkdir(exist_ok=True)
-    write_ply(folder / "clouds" / f"{view}.ply", cloud_file(cloud))
+    write_ply(folder / "clouds" / f"{view}.ply", Cloud(np.empty((0, 3))) if empty else cloud_file(cloud))
     table = folder / "views.csv"
     with table.open("a", newline="") as file:
         if not names:
@@ -104,7 +110,9 @@ def main(seed: int, faults: list[str]) -> int:
             done.touch()
             if fault == "hang":
                 time.sleep(3600)
-            return int(fault == "fail")
+            return (
+                0 if fault == "empty" and take(folder, pose["view"], joints, seed, empty=True) else int(fault == "fail")
+            )
     if "far" in faults and before and abs(joints[0] - before[0][0]) > _SHORT:
         return 3
     return 0 if take(folder, pose["view"], joints, seed) else 3

@@ -1,15 +1,18 @@
 """The verdict and what leads to it: questions asked in order, names held against what else may explain the views."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from bench.points import swept_joints, swept_session
 from data_synth import kinematics
 from data_synth.arms import ARMS
-from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
+from data_synth.ordinary_arm import draw_arm
+from data_synth.write import robot_table
 from stitch import diagnose, run
 from stitch.diagnosis import evidence as gathering
 from stitch.diagnosis import naming
@@ -27,6 +30,9 @@ from stitch.observations.surfaces.field_error import FieldError
 from stitch.observations.targets.target_model import target_model
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
+from stitch.session.reading.robot_description import robot_from_dh
+from stitch.session.robot import forward
+from stitch.session.session import Scanner, SessionData, Sighting, View
 from tests.diagnosis.freed_blade import freed_blade
 
 NO_CASE = gathering.Case(None, (), None)
@@ -369,8 +375,34 @@ def test_of_two_that_are_missing_the_one_of_a_believable_size_is_named():
     assert gathering.ask([gathering.is_its_size_believable], NO_CASE, alone).named == (large,)
 
 
+def swept_session(slip, at, rng):
+    """Reflectors on an IRB 120 whose joints are swept in turn, each up and back; the part slips (6,) at a view."""
+    arm = ARMS["ABB IRB 120"]
+    low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
+    order = rng.permutation(6)
+    rng.uniform(low, high)
+    joints = []
+    for joint in np.tile(order, 2):
+        posture = rng.uniform(low, high)
+        way = np.linspace(low[joint], high[joint], 6)
+        joints += [np.where(np.arange(6) == joint, angle, posture) for angle in (*way, *(way[::-1] + 0.02))]
+    joints = np.array(joints)
+    true = draw_arm(6, 0.0, rng).flange(arm, joints)
+    true = true @ frames.exp(np.repeat([2e-5, 0.02], 3) * rng.normal(size=joints.shape))
+    true[at:] = true[at:] @ frames.exp(slip)
+    X = frames.make(Rotation.random(rng=rng).as_matrix(), 1500 * rng.normal(size=3))
+    rows = [{key: row[key] for key in ("a", "alpha_deg", "d", "theta_deg")} for row in robot_table(arm)["joints"]]
+    robot = robot_from_dh("arm", "standard", rows, None, np.array([0, 0, -9.81]), "mm")
+    views = []
+    for v, (q, T) in enumerate(zip(joints, true, strict=True)):
+        points = frames.transform(frames.inverse(X) @ T, TARGETS[:3]) + 0.01 * rng.normal(size=(3, 3))
+        approach = np.sign(q - joints[max(v - 1, 0)])
+        sighting = Sighting(("t0", "t1", "t2"), points, np.full(3, 0.01))
+        views.append(View(f"v{v}", None, forward(robot, q), q, approach, 10.0 * v, {}, sighting))
+    scanner = Scanner(None, 0.01, None, np.array([0, 0, 1.0]), "tracker")
+    return SessionData(Path("arm"), "arm", "mm", "eye_to_hand", scanner, robot, None, None, None, tuple(views))
+
+
 def test_a_step_of_the_last_joint_and_a_part_that_turned_about_its_axis_are_not_told_apart():
-    rng = np.random.default_rng(409)
-    joints = swept_joints(ARMS["ABB IRB 120"], 6, rng)
-    found = diagnose(run(swept_session(joints, 0.0, rng, ("part_slip", "rz", -3.1e-4))))
+    found = diagnose(run(swept_session(np.array([0, 0, -3.1e-4, 0, 0, 0]), 48, np.random.default_rng(409))))
     assert found.verdict == "cannot_tell" and found.effects == ("joint_step", "part_slip")

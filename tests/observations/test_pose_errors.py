@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bench.real_arms import labelled_session, pose, seen_by
 from data_synth import kinematics
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
@@ -27,9 +26,9 @@ from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
+from tests.observations.honest_arms import BALLS, labelled_session, pose, seen_by
 
 VIEWS, SIZE = 12, 0.5
-BALLS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0], [10.0, 5.0, 95.0]])
 ALL_ONE = "the axis about which all views were turned"
 
 

@@ -11,7 +11,6 @@ from scipy import stats
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from bench.real_arms import WORLDS, bad_arm
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -26,6 +25,7 @@ from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.screening import pose_tests
 from stitch.screening.common_move import find_common_move
+from stitch.screening.deep_check import deep_check
 from stitch.screening.pose_tests import (
     expected_poses,
     find_blunders,
@@ -36,6 +36,7 @@ from stitch.screening.pose_tests import (
 from stitch.screening.view_model import projector, test_alternative
 from stitch.session.capture import prepare_capture
 from stitch.session.session import Cloud
+from tests.observations.honest_arms import WORLDS, bad_arm
 from tests.screening.direct_views import direct_views, with_z
 
 test_alternative.__test__ = False  # a function of the library, not a case
@@ -336,12 +337,14 @@ def test_a_view_that_is_off_is_no_factor():
 @pytest.mark.parametrize("world", WORLDS)
 @pytest.mark.parametrize("seed", [40, pytest.param(41, marks=pytest.mark.slow)])
 def test_a_bad_arm_is_neither_refused_nor_said_to_have_moved(world, seed):
-    assert bad_arm({"world": world, "times": 0.0, "seed": seed})["found"] == []
+    assert deep_check(bad_arm(world, 0.0, seed)[0]) == []
 
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_move_of_eight_times_its_error_is_named_with_the_view(world):
-    assert bad_arm({"world": world, "times": 8.0, "seed": 42})["moved"]
+    session, start = bad_arm(world, 8.0, 42)
+    (found,) = deep_check(session)
+    assert found.kind == "reclamped" and abs(int(found.views[0][1:]) - start) <= 1
 
 
 @pytest.mark.parametrize(("by", "sure"), [(0.3, True), (0.06, False)])

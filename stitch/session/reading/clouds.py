@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, NothingMeasuredError
 from stitch.numerics.frames import Array
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, read_depth_columns
 from stitch.session.reading.pcd_file import read_pcd
@@ -107,7 +107,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     coded = count - len(columns["x"])
     points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64, copy=False)
     if not len(points):
-        raise InputError(f"{where}: no points; leave this view out of views.csv or scan it again")
+        raise NothingMeasuredError(f"{where}: no points; leave this view out of views.csv or scan it again")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points).all(axis=1)).sum())
         raise InputError(f"{where}: {bad} of {len(points)} points are NaN or infinite; remove them from the file")
@@ -115,7 +115,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     x, y, z = points.T
     measured = (x != 0) | (y != 0) | (z != 0)
     if not measured.any():
-        raise InputError(
+        raise NothingMeasuredError(
             f"{where}: all {len(points)} points are 0 0 0, nothing was measured; leave this view out of views.csv or "
             "scan it again"
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, NothingMeasuredError
 from stitch.numerics.frames import Array
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
@@ -101,7 +101,7 @@ def _ascii_columns(
     # A header may announce more than memory holds: the lines that are there limit what is made room for.
     rows = min(count, body.count(b"\n") + 1)
     if not body.strip():
-        raise InputError(f"{path}: no points; leave this view out of views.csv or scan it again")
+        raise NothingMeasuredError(f"{path}: no points; leave this view out of views.csv or scan it again")
     widths = [int(np.prod(layout[name].shape)) for name in layout.names or ()]
     table = np.loadtxt(io.BytesIO(body), ndmin=2, max_rows=rows).reshape(-1, sum(widths))
     if len(table) < count:

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, NothingMeasuredError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.axes import Axis
@@ -227,7 +227,8 @@ def read_scans(
         try:
             return checked_scan(row.view.name, str(file), read, metres=metres, scanner=scanner, at_most=at_most)
         except InputError as error:
-            raise InputError(f"view {row.view.name} (views.csv line {row.line}): {error}") from None
+            kind = NothingMeasuredError if isinstance(error, NothingMeasuredError) else InputError
+            raise kind(f"view {row.view.name} (views.csv line {row.line}): {error}") from None
 
     return parallel(scan_of, rows, "reading scans")
 
@@ -248,7 +249,7 @@ def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:
     inside = cloud.within(within)
     if not len(inside.points):
         middle = ", ".join(f"{x:.3g}" for x in np.median(cloud.points, axis=0))
-        raise InputError(
+        raise NothingMeasuredError(
             f"{file}: none of its {len(cloud.points)} points is in the box scanner.within of session.toml, their "
             f"middle lies at ({middle}); to fix: make the box larger, or leave this view out of views.csv"
         )
@@ -273,7 +274,7 @@ def checked_scan(
     whole = read()
     cloud = distinct_points(whole)
     if len(cloud.points) < _FEWEST_POINTS:
-        raise InputError(
+        raise NothingMeasuredError(
             f"{where}: {len(cloud.points)} of at least {_FEWEST_POINTS} points; leave this view out of views.csv or "
             "scan it again"
         )

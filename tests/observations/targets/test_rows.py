@@ -10,17 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from bench.real_arms import THREE_SIGMA, turning, turning_session
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch import NoResultError
+from stitch import NoResultError, run
 from stitch.effects.contract import EFFECTS, missing_need
 from stitch.model.forward import PointSlopes, corrected_capture, target_correction
 from stitch.model.model import Model, term_of
+from stitch.numerics import frames
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
 from stitch.observations.targets.rows import initial_landmarks, target_rows
 from stitch.observations.targets.target_model import target_model
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
+from tests.observations.honest_arms import turning_session
 
 
 def off(T, true):
@@ -109,12 +110,14 @@ def test_effects_of_points_act_where_the_targets_lie_and_not_where_an_error_puts
 @pytest.mark.parametrize("within", [0, 1, 50])
 @pytest.mark.parametrize("targets", [3, 10])
 def test_a_flange_that_only_turns_shows_the_hand_eye_within_its_sigmas(targets, within, mount):
-    row = turning({"seed": 1, "targets": targets, "within": within, "mount": mount})
-    assert row["ended"] == "" and row["sigmas2"] < THREE_SIGMA
+    session, X = turning_session(targets, within, mount)
+    fit = run(session)
+    twist = frames.log(frames.inverse(fit.T_mount) @ X)
+    assert twist @ np.linalg.solve(fit.hand_eye.covariance, twist) < chi2.ppf(0.9973, 6)
 
 
 def test_a_board_of_88_points_shows_it_too_within_seconds():
-    session, X = turning_session({"seed": 1, "targets": 88, "within": 0, "mount": "eye_in_hand"})
+    session, X = turning_session(88, 0, "eye_in_hand")
     off = np.linalg.inv(closed_form_hand_eye(prepare_capture(session))) @ X
     assert np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec()) < 1e-3 and np.linalg.norm(off[:3, 3]) < 0.2
 

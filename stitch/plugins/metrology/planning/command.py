@@ -157,10 +157,11 @@ def _drive_cell(
     unit = load_session(folder, scans=False, start=joints).length_unit
     taken: list[tuple[int, float | None]] = []
 
-    def tell(views: int, U: float | None) -> None:
+    def tell(views: int, U: float | None, without_view: str) -> None:
         taken.append((views, U))
-        if not as_json:
-            say(f"{views} views: U at the part {'not known yet' if U is None else length_text(U, unit, 2)}")
+        known = "not known yet" if U is None else length_text(U, unit, 2)
+        if without_view or not as_json:
+            say(without_view or f"{views} views: U at the part {known}", stream=sys.stderr if as_json else None)
 
     try:
         drive(DrivenCell(folder, part, size, field, joints, most or 40), until_U, command, seconds, tell)

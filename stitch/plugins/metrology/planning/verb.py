@@ -86,7 +86,7 @@ def plan(
             raise InputError(f"stitch.plan: {cell} is a path; to fix: until_U=…, or pass stitch.load_session(…)")
         mesh = None if part is None else Path(part)
         joints = None if start is None else np.asarray(start, float)
-        return DrivenCell(Path(cell), mesh, size, field, joints).poses(until_U, lambda views, U: None)
+        return DrivenCell(Path(cell), mesh, size, field, joints).poses(until_U, lambda *_: None)
     at = None if feature is None else np.asarray(feature, float).reshape(-1)
     wanted = plan_request(views, split, halve, at)
     if isinstance(cell, RunData):

@@ -47,23 +47,35 @@ def test_a_command_that_fails_loses_no_view_and_the_next_call_goes_on(cell):
     command = f"{sys.executable} -m data_synth.cells.driven_cell {SEED} fail"
     told = []
     with pytest.raises(NoResultError, match="exit code 1"):
-        drive(cell, UNTIL, command, 60.0, lambda views, U: told.append((views, U)))
+        drive(cell, UNTIL, command, 60.0, lambda views, U, _: told.append((views, U)))
     assert rows(cell.folder) == 2
-    drive(cell, UNTIL, command, 60.0, lambda views, U: told.append((views, U)))
+    drive(cell, UNTIL, command, 60.0, lambda views, U, _: told.append((views, U)))
     assert told[-1][0] == rows(cell.folder) > 2
     assert told[-1][1] <= UNTIL
 
 
 def test_a_command_that_writes_no_view_or_takes_too_long_is_named(cell):
     with pytest.raises(NoResultError, match="has no further view"):
-        drive(cell, UNTIL, "true", 60.0, lambda views, U: None)
+        drive(cell, UNTIL, "true", 60.0, lambda *_: None)
     with pytest.raises(NoResultError, match=r"no answer after 0\.2 s"):
-        drive(cell, UNTIL, "sleep 5", 0.2, lambda views, U: None)
+        drive(cell, UNTIL, "sleep 5", 0.2, lambda *_: None)
 
 
 def test_an_unreachable_first_pose_ends_without_a_view(cell):
-    drive(cell, UNTIL, f"{sys.executable} -c 'raise SystemExit(3)'", 60.0, lambda views, U: None)
+    drive(cell, UNTIL, f"{sys.executable} -c 'raise SystemExit(3)'", 60.0, lambda *_: None)
     assert rows(cell.folder) == 0
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_scan_that_shows_nothing_is_said_and_another_pose_is_sought(cell, first):
+    told = []
+    for number, pose in enumerate(cell.poses(UNTIL, lambda *said: told.append(said))):
+        take(cell.folder, pose["view"], np.radians(pose["joints_deg"]), SEED, empty=number == (0 if first else 2))
+    without = [why for _, _, why in told if why]
+    assert len(without) == 1 and without[0].startswith(f"{'d000' if first else 'd002'}: its scan shows nothing")
+    assert rows(cell.folder) == number * (not first)
+    if not first:
+        assert len(stitch.load_session(cell.folder).views) == number
 
 
 def test_ctrl_c_leaves_what_was_scanned(cell, monkeypatch):
@@ -74,7 +86,7 @@ def test_ctrl_c_leaves_what_was_scanned(cell, monkeypatch):
 
     monkeypatch.setattr(driving, "call_program", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        drive(cell, UNTIL, "cell", 60.0, lambda views, U: None)
+        drive(cell, UNTIL, "cell", 60.0, lambda *_: None)
     assert rows(cell.folder) == 1
 
 

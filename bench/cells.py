@@ -1,7 +1,10 @@
-"""External axes: places found with their sigma, the cloud beside an arm's alone, faults named, and a ball as a rival.
+"""Cells with external axes, and with several scanners: what is found against the truth, and what is named.
 
-A table, a rail, a positioner stated wrongly by 1 mm and 1 mrad, or not at all; hand-eyes likewise searched. The rival
-places a turntable as is usual: a ball on it, its centre fitted in every view, a circle through the centres.
+AXES: places found with their sigma, the cloud beside an arm's alone, and a ball as a rival. A table, a rail, a
+positioner stated wrongly by 1 mm and 1 mrad, or not at all; hand-eyes likewise searched. The rival places a turntable
+as is usual: a ball on it, its centre fitted in every view, a circle through the centres.
+
+SCANNERS: hand-eyes together and alone, one scanner's own effect named.
 """
 
 import tempfile
@@ -15,6 +18,8 @@ from scipy.optimize import least_squares
 import stitch
 from bench.harness import Parts, Row, Table, grouped, markdown, named_shares, share
 from data_synth.cells.axis_cell import AxisCell, axis_cell, write_cell
+from data_synth.cells.scanner_cell import KINDS as SCANNER_KINDS
+from data_synth.cells.scanner_cell import NAMES, ScannerCell, scanner_cell, write_scanners
 from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
@@ -181,5 +186,86 @@ def _ball_lines(rows: list[Row]) -> list[str]:
     return markdown("turntable placed by | direction, mrad | place, µm | cloud by the model, µm", table)
 
 
-_PARTS = Parts({"found": (found, _found_lines), "named": (named, _named_lines)})
-TABLE = Table(jobs, _PARTS.trial, _PARTS.summary, range(200, 220), page="axes", block="axes", settings={"faulty": 8})
+_AXES = Parts({"found": (found, _found_lines), "named": (named, _named_lines)})
+AXES = Table(jobs, _AXES.trial, _AXES.summary, range(200, 220), page="axes", block="axes", settings={"faulty": 8})
+
+
+# What is hidden in one of the two, times what the cell has at amplitude 1: twice what development seeds could detect.
+SCANNER_FAULTS = (("field_curvature", 2.0), ("range_scale", 4.0))
+# Of a scanner's frame, where it sees the part, mm.
+_MIDDLE = np.array([0.0, 0.0, 420.0])
+
+
+def scanner_jobs(seeds: range) -> Iterator[Row]:
+    """Yield every trial."""
+    for seed in seeds:
+        for kind in SCANNER_KINDS:
+            yield {"part": "found", "kind": kind, "seed": seed}
+            for fault, amplitude in SCANNER_FAULTS:
+                yield {"part": "named", "kind": kind, "fault": fault, "amplitude": amplitude, "seed": seed}
+
+
+def _run_scanners(cell: ScannerCell) -> stitch.Run:
+    with tempfile.TemporaryDirectory() as folder:
+        return stitch.run([stitch.load_session(path) for path in write_scanners(Path(folder), cell)])
+
+
+def _off_hand_eye(true: Array, found: Array, covariance: Array) -> dict[str, float]:
+    twist = frames.log(frames.inverse(true) @ found)
+    moved = frames.transform(found, _MIDDLE) - frames.transform(true, _MIDDLE)
+    square = float(twist @ np.linalg.solve(covariance, twist)) / 6
+    return {"chi2": square, "off": 1e3 * float(np.linalg.norm(moved))}
+
+
+def found_scanners(job: Row) -> Row:
+    """Return both hand-eyes against the truth, together and alone, and what is named where nothing is hidden."""
+    cell = scanner_cell(job["kind"], job["seed"])
+    run = _run_scanners(cell)
+    diagnosis = stitch.diagnose(run)
+    scanners = []
+    for k, place in enumerate(run.scanners):
+        own = place.alone
+        assert own is not None
+        together = _off_hand_eye(cell.T_mount[k], place.T_mount, place.covariance)
+        alone = _off_hand_eye(cell.T_mount[k], own.hand_eye, own.covariance)
+        scanners.append({"U": place.U, "U_alone": place.U_alone, "together": together, "alone": alone})
+    doubts = sum("contradicts" in doubt for doubt in run.doubts)
+    return {"scanners": scanners, "doubts": doubts, "verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+
+
+def named_scanner(job: Row) -> Row:
+    """Return what a diagnosis names where one scanner errs."""
+    whose = job["seed"] % 2
+    diagnosis = stitch.diagnose(
+        _run_scanners(scanner_cell(job["kind"], job["seed"], {job["fault"]: (whose, job["amplitude"])}))
+    )
+    true = f"{job['fault']}@{NAMES[whose]}"
+    return {"true": true, "verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+
+
+def _scanner_lines(rows: list[Row]) -> list[str]:
+    table = []
+    for kind, of in grouped(rows, "kind").items():
+        every = [scanner for row in of for scanner in row["scanners"]]
+        chi2, alone = (np.mean([s[how]["chi2"] for s in every]) for how in ("together", "alone"))
+        off, off_alone = (np.median([s[how]["off"] for s in every]) for how in ("together", "alone"))
+        ratio = np.median([s["U"] / s["U_alone"] for s in every])
+        smaller = share(s["U"] < s["U_alone"] for s in every)
+        adequate = share(row["verdict"] == "adequate" for row in of)
+        wrong = share(bool(row["effects"]) for row in of)
+        against = (f"{chi2:.2f} ({alone:.2f})", f"{off:.0f} ({off_alone:.0f})", f"{ratio:.2f}")
+        table.append((kind, str(len(of)), *against, smaller, adequate, wrong))
+    head = "cell | cells | χ²/6 (alone) | off at the part, µm (alone) | U over alone | smaller | adequate | wrong name"
+    return markdown(head, table)
+
+
+def _scanner_named_lines(rows: list[Row]) -> list[str]:
+    groups = grouped(rows, "kind", "fault").items()
+    table = [(kind, f"`{fault}`", str(len(of)), *named_shares(of)) for (kind, fault), of in groups]
+    return markdown("cell | hidden in one | cells | named for that one | in a group | wrong", table)
+
+
+_SCANNERS = Parts({"found": (found_scanners, _scanner_lines), "named": (named_scanner, _scanner_named_lines)})
+SCANNERS = Table(
+    scanner_jobs, _SCANNERS.trial, _SCANNERS.summary, range(400, 420), page="several-scanners", block="scanners"
+)
