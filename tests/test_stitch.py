@@ -241,12 +241,13 @@ def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
         import numpy as np
         from data_synth.fixtures.blade_cells import captured_blade
         from stitch.plugins.cells import cad, scan_to_cad
-        from stitch.fusion.fuse import fuse
+        from stitch.fusion.fuse import fuse_points, place_scans
         from stitch.fit.coarse import motion_candidates
         from stitch.output.mesh import mesh_of
         measured, capture = captured_blade(0, views=4, pixels=60)
         assert motion_candidates([capture])
-        fused = fuse(capture, measured.T_reference_scanner)
+        placed = place_scans(capture.scans, measured.T_reference_scanner)
+        fused = fuse_points(placed, capture.spacing, np.eye(4))
         assert len(mesh_of(fused.points, fused.normals).triangles)
         distance, _, _ = cad.nearest_partners(cad.cad_surface(measured.mesh), fused.points, fused.normals)
         print(float(np.median(np.abs(distance))) < 0.1)

@@ -32,8 +32,8 @@ from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, seconds_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
 from stitch.session.reading.session_folder import checked_scan
-from stitch.session.reading.session_toml import read_axes, read_repeatability, read_robot, read_scanner, require_table
-from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
+from stitch.session.reading.session_toml import TABLE_KEYS, read_axes, read_repeatability, read_robot, read_scanner
+from stitch.session.reading.text_files import require_folder_name, require_known_keys, require_name, table_choice
 from stitch.session.reading.views_table import require_covariate_name, require_same_pose
 from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
@@ -183,11 +183,12 @@ class Session(SessionData):
             if not isinstance(scanner, Scanner):
                 table = dict(scanner or {})
                 # Files alone are cut, and moved point by point.
-                require_table(toml, "scanner", table, without=("within", "moving"))
+                known = [key for key in TABLE_KEYS["scanner"] if key not in ("within", "moving")]
+                require_known_keys(toml, table, known, "scanner")
                 scanner = read_scanner(toml, table)
             if robot is not None and not isinstance(robot, Robot):
                 table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
-                require_table(toml, "robot", table)
+                require_known_keys(toml, table, TABLE_KEYS["robot"], "robot")
                 repeatability = read_repeatability(toml, table)
                 robot = read_robot(toml, table, unit)
         return cls(

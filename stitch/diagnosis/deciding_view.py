@@ -524,7 +524,7 @@ def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _Fur
     unnamed = scored if isinstance(scored, JointEffect) else None
     base = scored.model if isinstance(scored, JointEffect) else model_beside(linear, scored)
     measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre
-    hand_eye = hand_eye_jacobian(measurement.capture.hand_eye_frames(bare.T_mount), centre)
+    hand_eye = hand_eye_jacobian(measurement.capture, bare.T_mount, centre)
     all_columns = [hand_eye, _used_columns(linear, scans)]
     if isinstance(scored, Score):
         all_columns.append(_twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep])

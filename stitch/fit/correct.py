@@ -240,9 +240,7 @@ def common_step(
     """
     D = np.zeros((6, 6))
     b = np.zeros(6)
-    jacobians = [
-        hand_eye_jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)
-    ]
+    jacobians = [hand_eye_jacobian(c, T_mount, o.gram.centre) for c, o in zip(captures, overlaps, strict=True)]
     for J, o in zip(jacobians, overlaps, strict=True):
         # Sessions of different noise count by their own variance.
         H, vector = assemble(o.gram)

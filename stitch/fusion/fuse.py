@@ -94,7 +94,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     support = find_support(scans, poses, placed, place)
     if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
-        return _moved(_fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), T_part), dropped
+        return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell, T_part), dropped
     del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
     slabs = _cut_into_slabs(registered, cell, max(1, int(place / cell)), slab)
@@ -130,20 +130,18 @@ def has_whole_clouds(session: SessionData) -> bool:
     return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
 
 
-def fuse(capture: Capture, poses: Array, cell: float | None = None, T_part: Array | None = None) -> FusedCloud:
-    """Return all points of all views averaged in cells of a grid, in the reference frame.
+def fuse_points(placed: PlacedPoints, cell: float, T_part: Array) -> FusedCloud:
+    """Return placed points averaged in cells of a grid, in the reference frame.
 
     `residual` is the rms distance of the views' surfaces from the fused one along its normal, length_unit, NaN where
     one view alone shows it; `count` the number of views per point.
 
     Args:
-        poses: (V, 4, 4) T_reference_scanner.
-        cell: edge of a cell, length_unit; None: the scans' spacing.
-        T_part: (4, 4) T_reference_part, along whose axes the grid lies; None: the principal axes of the points.
+        placed: in the part's frame, along whose axes the grid lies.
+        cell: edge of a cell, length_unit.
+        T_part: (4, 4) T_reference_part.
     """
-    T_part = part_axes(capture.scans, poses) if T_part is None else T_part
-    placed = place_scans(capture.scans, frames.inverse(T_part) @ poses)
-    return _moved(_fuse_points(placed, cell or capture.spacing), T_part)
+    return _moved(_fuse_voxels(_voxels(placed, cell_numbers(placed.points, cell))), T_part)
 
 
 def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
@@ -184,11 +182,6 @@ def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
 def _moved(cloud: FusedCloud, T: Array) -> FusedCloud:
     """Return a fused cloud with its points and normals moved by T (4, 4)."""
     return replace(cloud, points=frames.transform(T, cloud.points), normals=frames.rotate(T, cloud.normals))
-
-
-def _fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
-    """Return the mean surface of placed points in cells of `size`."""
-    return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
 
 
 @dataclass(frozen=True)

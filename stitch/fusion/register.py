@@ -192,8 +192,7 @@ def normal_equations(
     g = append_targets(surfaces, overlaps.targets, capture.noise_factor)
     variance = g.variance * scatter.noise_factor
     prior = prior_precision(capture, scatter, g.centre)
-    to_centre = frames.make(np.eye(3), -g.centre)
-    off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
+    off = frames.twists_about(g.centre, model_poses, poses)
     H, b = assemble(g)
     H = H / variance
     b = b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
@@ -204,7 +203,7 @@ def normal_equations(
 
 def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
     """Return the inverse covariance (V, 6, 6) of the views' left twists about `centre` (3,) by the flange's scatter."""
-    carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
+    carried = frames.adjoint_about(centre, capture.T_reference_flange)
     sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
     return np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)).astype(float, copy=False)
 
@@ -234,7 +233,7 @@ def pose_covariance(
     g, size = overlaps.gram, 6 * len(poses)
     variance = g.variance * scatter.noise_factor
     prior = prior_precision(capture, scatter, g.centre)
-    K = with_free_mean(prior, hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre))
+    K = with_free_mean(prior, hand_eye_jacobian(capture, T_mount, g.centre))
     equations = normal_equations(overlaps, capture, poses, poses, scatter=scatter, method=method)
     inverse = symmetric_inverse(equations.H - block_diag(*prior) + K)
     weights = method.weigh(overlaps.matches, capture, poses)
@@ -314,9 +313,7 @@ def unseen_moves(registration: Registration, model_poses: Array) -> Array:
     for side in g.pairs.T:
         np.add.at(blocks, side, g.matrix / np.outer(factors, factors))
     values, vectors = np.linalg.eigh(blocks)
-    to_centre = frames.make(np.eye(3), -g.centre)
-    motions = to_centre @ registration.poses @ frames.inverse(model_poses) @ frames.inverse(to_centre)
-    moved = frames.log(motions) * factors
+    moved = frames.twists_about(g.centre, model_poses, registration.poses) * factors
     along = np.einsum("vik,vi->vk", vectors, moved - moved.mean(axis=0))
     return np.linalg.norm(along * (values < NEAR_NULL * values[:, -1:]), axis=1)
 
@@ -332,8 +329,7 @@ def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[
         poses: T_reference_scanner (V, 4, 4) of the model.
     """
     V = len(rows.lever)
-    to_centre = frames.make(np.eye(3), -rows.centre)
-    carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
+    carried = frames.adjoint_about(rows.centre, rows.capture.T_reference_flange)
     scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
     covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
     pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])

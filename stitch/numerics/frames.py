@@ -94,6 +94,15 @@ def adjoint(T: Array) -> Array:
     return out
 
 
+def adjoint_about(centre: Array, T: Array) -> Array:
+    """Return matrices (..., 6, 6) from twists in frame b to twists in frame a that turn about its point `centre` (3,).
+
+    Args:
+        T: (..., 4, 4) T_a_b.
+    """
+    return adjoint(make(np.eye(3), -centre) @ T)
+
+
 def left_jacobian(xi: Array) -> Array:
     """Return J (..., 6, 6) with exp(ξ + δ) ≈ exp(J δ) · exp(ξ) for small twists δ (..., 6), at twists ξ (..., 6).
 

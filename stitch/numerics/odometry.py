@@ -186,4 +186,5 @@ def angle_differences(A: Array, B: Array) -> Array:
 
 def motions_between(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
     """Return (M, 4, 4) motions that map the frame of view w into that of view v, of poses (V, 4, 4)."""
-    return np.array([frames.inverse(poses[v]) @ poses[w] for v, w in pairs]).reshape(-1, 4, 4)
+    v, w = np.array(pairs, int).reshape(-1, 2).T
+    return frames.inverse(poses[v]) @ poses[w]

@@ -65,8 +65,7 @@ def motion_gain(
     squares, views = np.zeros((6 * scanners, 6 * scanners)), 0
     for capture in captures:
         poses = capture.poses(T_mount) @ about
-        to_part = frames.make(np.eye(3), -poses[:, :3, 3].mean(axis=0))
-        J = np.linalg.inv(scale) @ frames.adjoint(to_part @ poses) @ scale
+        J = np.linalg.inv(scale) @ frames.adjoint_about(poses[:, :3, 3].mean(axis=0), poses) @ scale
         if capture.scanner is not None:
             is_own = np.eye(scanners)[capture.scanner]
             J = np.einsum("vij,vs->visj", J, is_own).reshape(len(poses), 6, -1)

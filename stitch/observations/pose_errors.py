@@ -141,7 +141,7 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
         centres: per session the point (3,) about which the twists turn, reference frame.
     """
     adjoints = [
-        frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
+        frames.adjoint_about(centre, m.capture.T_reference_flange)
         for m, centre in zip(measurements, centres, strict=True)
     ]
     return np.concatenate(adjoints).reshape(-1, 6) * usual_twist(measurements[0].length_unit)

@@ -59,8 +59,7 @@ class Rows(ABC):
     @cached_property
     def hand_eye(self) -> Array:
         """(B, m, 6) change of the rows per right twist ξ of the hand-eye, T_mount·exp(ξ); zero in blocks of no view."""
-        to_centre = frames.make(np.eye(3), -self.centre)
-        of_views = self.lever @ frames.adjoint(to_centre @ self.capture.hand_eye_frames(self.T_mount))
+        of_views = self.lever @ frames.adjoint_about(self.centre, self.capture.hand_eye_frames(self.T_mount))
         return np.concatenate([of_views, np.zeros((len(self.residual) - len(of_views), *of_views.shape[1:]))])
 
     @property
@@ -125,8 +124,7 @@ class Rows(ABC):
     @cached_property
     def scattered(self) -> tuple[Array, Array]:
         """(V, m, 3) changes of the rows per rotation, and per translation, of the flange in its own frame."""
-        to_centre = frames.make(np.eye(3), -self.centre)
-        per_flange_twist = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
+        per_flange_twist = self.lever @ frames.adjoint_about(self.centre, self.capture.T_reference_flange)
         return per_flange_twist[..., :3], per_flange_twist[..., 3:]
 
     @cached_property

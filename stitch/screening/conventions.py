@@ -33,7 +33,6 @@ from stitch.screening.motions import (
     RelativeScans,
     fit_motions,
     fit_positions,
-    rotation_angles,
     screen_hypotheses,
 )
 from stitch.session.session import SessionData
@@ -176,7 +175,7 @@ def _accused_views(stated: MotionFit, motions: RelativeScans, length: float) -> 
     T = stated.hypothesis.T_reference_mount
     v, w = np.array(motions.pairs).T
     off = frames.inverse(stated.T_mount) @ frames.inverse(T[v]) @ T[w] @ stated.T_mount @ frames.inverse(motions.T)
-    wrong = (rotation_angles(off) > ROTATION) | (np.linalg.norm(off[:, :3, 3], axis=1) > length)
+    wrong = (frames.angle_between(np.eye(4), off) > ROTATION) | (np.linalg.norm(off[:, :3, 3], axis=1) > length)
     open_share = np.array(
         [wrong[(v == i) | (w == i)].mean() if np.any((v == i) | (w == i)) else 1 for i in range(len(T))]
     )
@@ -287,13 +286,14 @@ def lagging_poses(stated: Hypothesis, motions: RelativeScans) -> Iterator[Hypoth
     """
     T = stated.T_base_flange
     v, w = np.array(motions.pairs).T
+    angles = frames.angle_between(np.eye(4), motions.T)
     shares = _LAGS
     # A coarse grid of shares, then a fine one about its best.
     for width in (0.0, _LAGS[1] - _LAGS[0]):
         shares = np.clip(shares + np.linspace(-width, width, len(_LAGS)), 0, _LAGS[-1])
         ahead = _without_lag(T, shares, along_lines=False)
-        turned = rotation_angles((frames.inverse(ahead[:, v]) @ ahead[:, w]).reshape(-1, 4, 4)).reshape(len(shares), -1)
-        off = np.abs(turned - rotation_angles(motions.T)).clip(max=_LAG_OFF * ROTATION).mean(axis=1)
+        turned = frames.angle_between(ahead[:, v], ahead[:, w])
+        off = np.abs(turned - angles).clip(max=_LAG_OFF * ROTATION).mean(axis=1)
         shares = np.full(len(_LAGS), shares[np.argmin(off)])
     if shares[0] > _LAGS[0]:
         for along_lines in (False, True):
@@ -349,7 +349,7 @@ def _by_table_part(tried: Sequence[Hypothesis], motions: RelativeScans, names: S
     sides = [side for k in range(1, count) for side in (np.arange(count) < k, np.arange(count) >= k)]
     sides = [side for side in sides if min((side[v] & side[w]).sum(), (~side[v] & ~side[w]).sum()) >= FEWEST]
     stated = tried[0]
-    angles = rotation_angles(motions.T)
+    angles = frames.angle_between(np.eye(4), motions.T)
     for h in tried[1:]:
         if h.kind not in _OF_ONE_ROW or not sides:
             continue

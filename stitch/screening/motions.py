@@ -100,15 +100,10 @@ def _start_rotations() -> Array:
     return Rotation.from_rotvec(np.array([np.zeros(3), *vectors])).as_matrix()
 
 
-def rotation_angles(T: Array) -> Array:
-    """Return the angles of rotation (M,) of motions (M, 4, 4), rad."""
-    return np.arccos(np.clip((np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-
-
 def alike(T: Array, other: Array, length: float) -> Mask:
     """Return (M,) True for motions (M, 4, 4) that differ by no more than one may leave open: `length`, length_unit."""
-    off = frames.inverse(T) @ other
-    return np.asarray((rotation_angles(off) < ROTATION) & (np.linalg.norm(off[:, :3, 3], axis=1) < length))
+    moved = np.linalg.norm((frames.inverse(T) @ other)[:, :3, 3], axis=1)
+    return (frames.angle_between(T, other) < ROTATION) & (moved < length)
 
 
 def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> list[Hypothesis]:
@@ -117,13 +112,13 @@ def screen_hypotheses(tried: Sequence[Hypothesis], motions: RelativeScans) -> li
     Under any hand-eye mount and scanner turn by the same angle (Chen 1991), so that this test needs none.
     """
     v, w = np.array(motions.pairs).T
-    angles = rotation_angles(motions.T)
+    angles = frames.angle_between(np.eye(4), motions.T)
     shares = []
     for h in tried:
         T = h.T_reference_mount
         used = np.ones(len(T), bool) if h.used is None else np.isin(np.arange(len(T)), h.used)
         kept = used[v] & used[w]
-        near = np.abs(rotation_angles(frames.inverse(T[v]) @ T[w]) - angles) < ROTATION
+        near = np.abs(frames.angle_between(T[v], T[w]) - angles) < ROTATION
         shares.append(float(near[kept].mean()) if kept.any() else 0.0)
     limit = _SCREEN * max(shares)
     return [tried[0]] + [h for h, share in zip(tried[1:], shares[1:], strict=True) if share >= limit]

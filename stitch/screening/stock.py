@@ -205,8 +205,8 @@ def _whole_offsets(
     sums = OffsetSums(g, overlaps.matches, weights, capture)
     variance = g.variance * max(scatter.noise_factor, 1.0)
     H, b = assemble(g, ~g.labelled)
-    jacobian = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
-    K = with_free_mean(prior_precision(capture, scatter, g.centre), jacobian)
+    of_hand_eye = hand_eye_jacobian(capture, T_mount, g.centre)
+    K = with_free_mean(prior_precision(capture, scatter, g.centre), of_hand_eye)
     H = H / variance + K
     C = sums.coupling.reshape(len(H), -1) / variance
     solved = symmetric_inverse(H) @ np.column_stack([C, b / variance + K @ unconstrained.twists.ravel()])
@@ -232,14 +232,17 @@ def stock_of(
     case = _hold_against_others(capture, T_mount, gate, view, off, usual)
     if case is None:
         return None
-    best = _fit(case, "stock")
-    if best is None or best.share < _LEAST_SHARE or best.over_torn < _OVER_TORN:
+    explained = _fit(case, case.held, has_stock=True)
+    if explained is None:
         return None
-    if abs(best.thickness) < max(_LEAST * case.sigma, _SURE * best.sigma, _TIMES_SCATTER * case.scatter):
+    evidence, stock, over_torn = explained
+    if stock.share < _LEAST_SHARE or over_torn < _OVER_TORN:
         return None
-    rivals = [fit.evidence for fit in (_fit(case, "moved"), _fit(case, "still")) if fit is not None]
-    is_clear = best.evidence > max(rivals, default=-np.inf) + _MARGIN
-    return Stock(best.thickness, best.sigma, best.share, best.points) if is_clear else None
+    if abs(stock.thickness) < max(_LEAST * case.sigma, _SURE * stock.sigma, _TIMES_SCATTER * case.scatter):
+        return None
+    rivals = [_fit(case, precision, has_stock=False) for precision in (case.free, case.held)]
+    is_clear = evidence > max((fit[0] for fit in rivals if fit is not None), default=-np.inf) + _MARGIN
+    return stock if is_clear else None
 
 
 @dataclass(frozen=True)
@@ -260,12 +263,17 @@ class _Case:
     factor: float  # of its variance: distances share points
     scatter: float  # of the robot's poses, length_unit
 
-    def distances(self, x: Array, offset: Array) -> "_Distances | None":
-        """Return the distances of the view's points from the surface of the others; None for fewer than `_FEWEST`.
+    def distances(self, x: Array, offset: Array) -> tuple[Indices, Array, Array, Array, Array] | None:
+        """Return M distances of the view's points from the surface of the others; None for fewer than `_FEWEST`.
 
         Args:
             x: (6V,) left twists of the views about `centre` from `start`.
             offset: (N,) shift of the view's points against their normals, length_unit.
+
+        Returns:
+            The number of the view's point (M,); its signed distance (M,) along the mean of its normal and the
+            surface's, length_unit; the weight (M,) of that; the cosine (M,) between its normal and that mean; the
+            change of the distance by twists of all views (M, 6V).
         """
         poses = frames.moved_about(self.centre, x.reshape(-1, 6), self.start)
         scan = self.capture.scans[self.view]
@@ -286,18 +294,7 @@ class _Case:
         rows[:, self.view] = view_rows
         rows[np.arange(len(distance)), partner] -= view_rows
         cosine = np.einsum("ni,ni->n", frames.rotate(poses[self.view], scan.normals[index]), normal)
-        return _Distances(distance, weight, index, cosine, rows.reshape(len(distance), -1))
-
-
-@dataclass(frozen=True)
-class _Distances:
-    """Distances of M points of the view from the surface of the others."""
-
-    distance: Array  # (M,) signed, along the mean normals of view and surface, length_unit
-    weight: Array  # (M,)
-    index: Indices  # (M,) numbers of the view's points
-    cosine: Array  # (M,) between their normals and the mean normals
-    by_twists: Array  # (M, 6V) change of the distances by twists of all views
+        return index, distance, weight, cosine, rows.reshape(len(distance), -1)
 
 
 def _hold_against_others(
@@ -341,7 +338,7 @@ def _hold_against_others(
     start = np.array(poses)
     start[others] = unconstrained.poses
     # What a correction of the hand-eye does to all views stays free.
-    of_hand_eye = hand_eye_jacobian(capture.hand_eye_frames(T_mount), g.centre)
+    of_hand_eye = hand_eye_jacobian(capture, T_mount, g.centre)
     precision = prior_precision(capture, Repeatability(rotation, translation, factor), g.centre)
     without_view = precision.copy()
     without_view[view] = 0.0
@@ -375,44 +372,39 @@ def _views_to_compare(capture: Capture, T_mount: Array, view: int, off: Collecti
     return np.union1d(np.setdiff1d(nearest, list(off)), [view]).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """One explanation of a view's distances, fitted: stock, a wrong pose, or neither."""
+def _fit(case: _Case, precision: Array, has_stock: bool) -> tuple[float, Stock, float] | None:
+    """Return one explanation of a view's distances, fitted with all poses; None where too few distances remain.
 
-    thickness: float  # of the stock, length_unit
-    sigma: float  # of the thickness
-    points: Mask  # (N,) of the view, that have stock
-    share: float  # of the view's surface that has stock
-    evidence: float  # log likelihood of distances and poses
-    over_torn: float  # nats by which stock on its region is likelier than a motion of the region; inf without one
+    Without stock the view is displaced, or stays where the robot has it: `precision` says how the robot holds the
+    poses. With stock a thickness on the view, or on a region of it, is fitted too. Each step matches anew, finds the
+    region, and takes a Gauss–Newton step of twists and thickness; the scale of the robust weights is halved from that
+    of all distances to that of noise.
 
+    Args:
+        precision: (6V, 6V) of the poses by the robot, `case.held` or `case.free`.
 
-def _fit(case: _Case, kind: str) -> _Fit | None:
-    """Return the fit of all poses under one explanation of a view's distances; None where too few remain.
-
-    `still`: the view is held by the robot's prior. `moved`: its pose is free. `stock`: held, with a thickness on it or
-    on a region of it. Each step matches anew, finds the region, and takes a Gauss–Newton step of twists and thickness;
-    the scale of the robust weights is halved from that of all distances to that of noise.
+    Returns:
+        The log likelihood of distances and poses, nats; the stock, of thickness 0 without; and the nats by which stock
+        on its region is likelier than a motion of that region, infinite without one.
     """
-    precision = case.free if kind == "moved" else case.held
     # The start: minimum of the others' normal equations with the robot's prior.
     x = -symmetric_inverse(case.H + case.held) @ (case.b + case.held @ case.twists)
     thickness, scale = 0.0, np.inf
-    scanned = case.capture.scans[case.view].points
-    points = np.zeros(len(scanned), bool)
+    scan = case.capture.scans[case.view]
+    points = np.zeros(len(scan.points), bool)
     for _ in range(_STEPS):
-        found = case.distances(x, thickness * points)
-        if found is None:
+        observed = case.distances(x, thickness * points)
+        if observed is None:
             return None
-        index, weight = found.index, found.weight
+        index, from_surface, weight, cosine, by_twists = observed
         # Distances of the points where the scan has them, its stock not taken off.
-        distance = found.distance + thickness * found.cosine * points[index]
+        distance = from_surface + thickness * cosine * points[index]
         member, edge = np.zeros((2, len(distance)), bool)
-        if kind == "stock":
-            thickness, member, edge = _region(scanned[index], distance, thickness, case.sigma)
+        if has_stock:
+            thickness, member, edge = _region(scan.points[index], distance, thickness, case.sigma)
         if member.any():
-            points = member[KDTree(scanned[index]).query(scanned)[1]]
-        rows = np.column_stack([found.by_twists, -found.cosine * member])
+            points = member[KDTree(scan.points[index]).query(scan.points)[1]]
+        rows = np.column_stack([by_twists, -cosine * member])
         residual = distance + thickness * rows[:, -1]
         scale = max(case.sigma, min(scale, mad_sigma(residual)))
         robust_weight = weight * tukey(residual, scale) * ~edge / (case.sigma**2 * case.factor)
@@ -425,24 +417,17 @@ def _fit(case: _Case, kind: str) -> _Fit | None:
         if largest_change < _NEAR * scale:
             scale /= 2
     inside = member & ~edge
-    if kind == "stock" and not robust_weight[inside].any():
+    if has_stock and not robust_weight[inside].any():
         # No region is left, or robust weights reject all of it.
         return None
-    area = case.capture.scans[case.view].area
     over_torn = np.inf
     if inside.any():
-        of_view = rows[:, 6 * case.view : 6 * case.view + 6]
-        over_torn = _over_torn(case, of_view[inside], distance[inside], residual[inside], weight[inside])
+        over_torn = _over_torn(case, rows[inside], distance[inside], residual[inside], weight[inside])
     t = case.twists + x
     pose_cost = 0.5 * float(t @ precision @ t + x @ case.H @ x) + float(case.b @ x)
-    return _Fit(
-        thickness=thickness,
-        sigma=_thickness_sigma(case, precision, information, gradients, index),
-        points=points,
-        share=float(area[points].sum() / area.sum()),
-        evidence=_evidence(case, residual, weight) - pose_cost,
-        over_torn=over_torn,
-    )
+    sigma = _thickness_sigma(case, precision, information, gradients, index)
+    stock = Stock(thickness, sigma, float(scan.area[points].sum() / scan.area.sum()), points)
+    return _evidence(case, residual, weight) - pose_cost, stock, over_torn
 
 
 def _gauss_newton_step(
@@ -508,11 +493,12 @@ def _over_torn(case: _Case, rows: Array, e: Array, left: Array, weight: Array) -
     1978, Ann. Stat. 6:461). n counts correlated distances as fewer.
 
     Args:
-        rows: (M, 6) change of the region's distances per twist of the region.
+        rows: (M, 6V + 1) change of the region's distances by twists of the views and the thickness.
         e: (M,) its distances from the other views, length_unit.
         left: (M,) residuals of these with stock.
         weight: (M,) of these.
     """
+    rows = rows[:, 6 * case.view : 6 * case.view + 6]
     # Residuals with a motion: robust least squares, reweighted from those with stock.
     moved = left
     for _ in range(_TORN_STEPS):

@@ -185,10 +185,9 @@ def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPos
         unconstrained: the views moved by the overlaps alone.
     """
     gram = unconstrained.overlaps.gram
-    mounts = capture.hand_eye_frames(T_mount)
     return ViewModel(
-        reduced=reduce_poses(gram, unconstrained.twists, mounts, capture),
-        mount_jacobians=hand_eye_jacobian(mounts, gram.centre).reshape(-1, 6, 6),
+        reduced=reduce_poses(capture, gram, unconstrained.twists, T_mount),
+        mount_jacobians=hand_eye_jacobian(capture, T_mount, gram.centre).reshape(-1, 6, 6),
         centre=gram.centre,
         lever=max(gram.lever, 1e-300),
     )
@@ -401,7 +400,7 @@ class UsualEffects:
         errors = prior_pose_errors([self.measurement], self.model, [centre])
         alike = drift_kernel([self.measurement], max(DRIFT_MEMORY.values()))
         unit = usual_twist(self.measurement.length_unit)
-        of_mount = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.hand_eye_frames(self.model.T_mount))
+        of_mount = frames.adjoint_about(centre, capture.hand_eye_frames(self.model.T_mount))
         of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
         for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
             errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)

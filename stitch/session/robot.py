@@ -121,17 +121,25 @@ def jacobian(robot: Robot, joints: Array) -> Array:
     return np.swapaxes(np.concatenate(turned, axis=-1), -1, -2)
 
 
-def unit_torques(robot: Robot, joints: Array) -> Array:
-    """Return torques of gravity (..., n, n), N·m, about joint i of 1 kg at the origin of link k's frame; 0 for k < i.
+def torques_per_kg(robot: Robot, joints: Array, places: Array) -> Array:
+    """Return torques of gravity (..., n, k), N·m, about +z of joint i of 1 kg at place j: z_i · (p_j − o_i) × g.
 
-    z_i · (p_k − o_i) × g, at joint angles (..., n) rad, about +z of the joint.
+    Place j moves with link j, one beyond the last with the flange: 0 where joint i does not carry it, j < i.
+
+    Args:
+        joints: (..., n) rad.
+        places: (..., k, 3) base frame.
     """
-    link = link_frames(robot, joints)
     point, axis = joint_axes(robot, joints)
-    lever = link[..., None, 1:, :3, 3] - point[..., :, None, :]
+    lever = places[..., None, :, :] - point[..., :, None, :]
     torque = np.einsum("...ij,...ikj->...ik", axis, np.cross(lever, robot.gravity))
-    number = np.arange(robot.n_joints)
-    return torque * robot.metres_per_unit * (number[None, :] >= number[:, None])
+    is_carried = np.arange(places.shape[-2]) >= np.arange(robot.n_joints)[:, None]
+    return torque * robot.metres_per_unit * is_carried
+
+
+def unit_torques(robot: Robot, joints: Array) -> Array:
+    """Return torques of gravity (..., n, n), N·m, about joint i of 1 kg at the origin of link k, at joints (..., n)."""
+    return torques_per_kg(robot, joints, link_frames(robot, joints)[..., 1:, :3, 3])
 
 
 def base_moments(robot: Robot, joints: Array) -> Array:
@@ -144,18 +152,15 @@ def mass_centres(robot: Robot, joints: Array) -> Array:
 
     Where the robot states none it is the origin of the link's frame, or of the flange.
     """
-    link = link_frames(robot, joints)
-    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
-    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
-    return np.concatenate([centres, tool[..., None, :]], axis=-2)
+    link = link_frames(robot, joints)[..., 1:, :, :]
+    bodies = np.concatenate([link, link[..., -1:, :, :]], axis=-3)
+    com = np.vstack([robot.com, robot.payload_com])
+    return (bodies[..., :3, :3] @ com[..., None])[..., 0] + bodies[..., :3, 3]
 
 
 def payload_torques(robot: Robot, joints: Array) -> Array:
-    """Return (..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
-    point, axis = joint_axes(robot, joints)
-    centre = mass_centres(robot, joints)[..., -1, :]
-    torque = np.einsum("...ij,...ij->...i", axis, np.cross(centre[..., None, :] - point, robot.gravity))
-    return torque * robot.metres_per_unit
+    """Return (..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass, at joints (..., n) rad."""
+    return torques_per_kg(robot, joints, mass_centres(robot, joints))[..., -1]
 
 
 def gravity_torques(robot: Robot, joints: Array) -> Array:
@@ -167,15 +172,7 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
     Args:
         joints: (..., n) rad.
     """
-    point, axis = joint_axes(robot, joints)
-    centres = mass_centres(robot, joints)
-    mass = np.append(robot.mass, robot.payload_mass)
-    # Link k is moved by joint i if k ≥ i; the payload by all.
-    beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]
-    moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
-    moment -= (beyond @ mass)[:, None] * point
-    torque = np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity))
-    return torque * robot.metres_per_unit
+    return torques_per_kg(robot, joints, mass_centres(robot, joints)) @ np.append(robot.mass, robot.payload_mass)
 
 
 @dataclass(frozen=True)

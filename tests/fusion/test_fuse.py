@@ -15,7 +15,7 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
-from stitch.fusion.fuse import RegisteredSession, fuse, fuse_every_point, part_axes, place_scans
+from stitch.fusion.fuse import RegisteredSession, fuse_every_point, fuse_points, part_axes, place_scans
 from stitch.fusion.look_through import range_images
 from stitch.fusion.support import cell_numbers, find_support
 from stitch.model.forward import corrected_capture
@@ -41,6 +41,12 @@ def registered(session, measured, effect=None):
     model = Model(measured.T_mount, terms)
     own = corrected_capture(measurement, model)
     return RegisteredSession(session, measurement, model, own, own.poses(measured.T_mount))
+
+
+def fuse(capture, poses, cell=None, T_part=None):
+    """All points of all views averaged, none left out."""
+    T_part = part_axes(capture.scans, poses) if T_part is None else T_part
+    return fuse_points(place_scans(capture.scans, frames.inverse(T_part) @ poses), cell or capture.spacing, T_part)
 
 
 def test_fused_cloud_lies_on_the_part():

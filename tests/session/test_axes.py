@@ -119,8 +119,8 @@ def three_views():
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"kind": "spherical"}, 'axis table: kind is .spherical.; here it is "rotary" or "linear"'),
-        ({"carries": "scanner"}, 'carries is .scanner.; here it is "part" or "robot"'),
+        ({"kind": "spherical"}, "axis table: kind is .spherical.; use 'rotary' or 'linear'"),
+        ({"carries": "scanner"}, "carries is .scanner.; use 'part' or 'robot'"),
         ({"direction": [0, 0, 0], "point": [0, 0, 0]}, "direction is zero"),
         ({"stated": True}, "stated = true needs direction and point"),
         ({"centre": [0, 0, 0]}, "unknown key .centre."),

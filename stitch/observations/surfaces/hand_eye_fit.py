@@ -92,14 +92,14 @@ class CaptureEvidence:
     capture: Capture
     gram: Gram
     twists: Array  # (V, 6) left twists about the Gram's centre, from the model's poses to the free-network poses
-    hand_eye_frames: Array  # (V, 4, 4) T_reference_mount·T_mount
+    T_mount: Array  # (4, 4) hand-eye about which all is linear
     effect_twists: Array  # (6V, P) left twists of the views per unit of each effect's parameter
     common_twists: Array  # (6V, K) per sigma of errors of several scanners that the fit counts; K = 0 for one scanner
 
     @cached_property
     def reduced_poses(self) -> ReducedPoses:
         """The twists reduced to the directions that the overlaps see, linearised about the hand-eye."""
-        return reduce_poses(self.gram, self.twists, self.hand_eye_frames, self.capture)
+        return reduce_poses(self.capture, self.gram, self.twists, self.T_mount)
 
     @property
     def effect_columns(self) -> Array | None:
@@ -118,7 +118,7 @@ class CaptureEvidence:
         stays = ~np.isin(np.arange(g.views), views)
         number = np.cumsum(stays) - 1
         gram = replace(g.only(keep), views=g.views - len(views), pairs=number[g.pairs[keep]])
-        kept = take_rows(self, stays, "twists", "hand_eye_frames")
+        kept = take_rows(self, stays, "twists")
         kept = take_rows(kept, np.repeat(stays, 6), "effect_twists", "common_twists")
         return replace(kept, capture=self.capture.without(views), gram=gram)
 
@@ -130,7 +130,7 @@ class CaptureEvidence:
             corrections: each (6 + P,): twist of the hand-eye, then changes of the effects' parameters.
         """
         touched = np.isin(self.gram.pairs, views).any(axis=1)
-        J = np.column_stack([hand_eye_jacobian(self.hand_eye_frames, self.gram.centre), self.effect_twists])
+        J = np.column_stack([hand_eye_jacobian(self.capture, self.T_mount, self.gram.centre), self.effect_twists])
         # The sums are at the free-network poses, which are `twists` away from the model's.
         from_free = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
         return np.array([pair_squares(self.gram, twists)[touched].sum() for twists in from_free])
@@ -404,7 +404,7 @@ def solve_hand_eye(
     if effects is None:
         effects = FittedEffects(no_columns, np.zeros(0), np.zeros(0))
     parts = [
-        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), of_effects, of_errors)
+        CaptureEvidence(c, f.overlaps.gram, f.twists, T_mount, of_effects, of_errors)
         for c, f, of_effects, of_errors in zip(
             captures, unconstrained, effects.twists, common or no_columns, strict=True
         )
@@ -463,31 +463,26 @@ def weak_prior(
     return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, effects**-2.0]))
 
 
-def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
-    """Return left twists (6V, 6) of the views about `centre` (3,) per right twist of the hand-eye, T_mount·exp(ξ).
-
-    Args:
-        hand_eye_frames: (V, 4, 4) T_reference_mount·T_mount.
-    """
-    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
+def hand_eye_jacobian(capture: Capture, T_mount: Array, centre: Array) -> Array:
+    """Return left twists (6V, 6) of the views about `centre` (3,) per right twist of the hand-eye, T_mount·exp(ξ)."""
+    return frames.adjoint_about(centre, capture.hand_eye_frames(T_mount)).reshape(-1, 6)
 
 
-def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Capture) -> ReducedPoses:
+def reduce_poses(capture: Capture, g: Gram, twists: Array, T_mount: Array) -> ReducedPoses:
     """Return the twists of all views reduced to the n directions that the overlaps see, z = R δ, with X and Σ of z.
 
     X is the response to the hand-eye, the covariances are those of a unit scatter of the flange and of the noise.
 
     Args:
+        capture: poses of the flange, and which views were scanned at one stop and share its scatter.
         g: normal equations at the poses that the overlaps alone determine, about the part's centre.
         twists: δ (V, 6), left twists about that centre from the model's poses to those, rad and length_unit.
-        hand_eye_frames: (V, 4, 4), T_reference_mount·T_mount: their adjoint carries a right twist of the hand-eye into
-            the reference frame.
-        capture: poses of the flange, and which views were scanned at one stop and share its scatter.
+        T_mount: (4, 4) hand-eye of the model's poses.
     """
     seen = g.visible
     reduction = seen.vectors.T / seen.scale
     # Left twists of the views per right twist of the flange.
-    per_flange_twist = frames.adjoint(frames.make(np.eye(3), -g.centre) @ capture.T_reference_flange)
+    per_flange_twist = frames.adjoint_about(g.centre, capture.T_reference_flange)
     # (V, n, 6) visible directions per unit rotation and translation of the flange in each view.
     blocks = reduction.reshape(len(reduction), -1, 6).transpose(1, 0, 2) @ per_flange_twist
     if capture.stop is not None:
@@ -498,7 +493,7 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, capture: Captur
         reduction=reduction,
         expansion=seen.scale[:, None] * seen.vectors,
         z=reduction @ twists.reshape(-1),
-        hand_eye=reduction @ hand_eye_jacobian(hand_eye_frames, g.centre),
+        hand_eye=reduction @ hand_eye_jacobian(capture, T_mount, g.centre),
         rotation=summed_squares(blocks[..., :3]),
         translation=summed_squares(blocks[..., 3:]),
         noise=np.diag(g.variance / seen.values),
@@ -570,8 +565,7 @@ def whiten_captures(
     """
     stacked = []
     for capture, views, twists in sessions:
-        hand_eye_frames = capture.hand_eye_frames(T_mount)
-        reduced = reduce_poses(views.overlaps.gram, views.twists, hand_eye_frames, capture)
+        reduced = reduce_poses(capture, views.overlaps.gram, views.twists, T_mount)
         effects = reduced.reduction @ twists
         covariance = pose_covariance(reduced, estimate_repeatability(reduced, effects[:, free]))
         columns = np.column_stack([reduced.hand_eye, effects, reduced.z + effects @ values])
@@ -582,5 +576,4 @@ def whiten_captures(
 
 def capture_repeatability(capture: Capture, unconstrained: UnconstrainedPoses, T_mount: Array) -> Repeatability:
     """Return the scatter of one capture's poses by REML, the hand-eye being free; linearised at T_mount (4, 4)."""
-    gram, twists = unconstrained.overlaps.gram, unconstrained.twists
-    return estimate_repeatability(reduce_poses(gram, twists, capture.hand_eye_frames(T_mount), capture))
+    return estimate_repeatability(reduce_poses(capture, unconstrained.overlaps.gram, unconstrained.twists, T_mount))

@@ -196,8 +196,7 @@ def surface_model(
             variances of rotation scatter, translation scatter, noise and these. None: fitted to the views.
     """
     gram = unconstrained.overlaps.gram
-    frames_of_mount = capture.hand_eye_frames(model.T_mount)
-    reduced = reduce_poses(gram, unconstrained.twists, frames_of_mount, capture)
+    reduced = reduce_poses(capture, gram, unconstrained.twists, model.T_mount)
 
     def fit_null(mixed: MixedModel, names: Sequence[str] = ()) -> VarianceFit:
         """Return the variances of a model, fitted, or those of planned views; `names` are its further components."""
@@ -222,7 +221,7 @@ def surface_model(
         measurement,
         model,
         SurfaceObservation(capture, unconstrained, reduced, gram.centre),
-        design=np.hstack([hand_eye_jacobian(frames_of_mount, gram.centre), twists[:, seen]]),
+        design=np.hstack([hand_eye_jacobian(capture, model.T_mount, gram.centre), twists[:, seen]]),
         sizes=np.append(np.full(6, np.inf), sizes[seen]),
         values=np.append(np.zeros(6), values[seen]),
         mixed=mixed,

@@ -22,7 +22,6 @@ from stitch.plugins.intake.layouts import POSE_UNITS, ColumnLayout, joint_layout
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.screening.hypotheses import ORDERS
-from stitch.screening.motions import rotation_angles
 from stitch.session.reading.robot_description import moving_joints, poses_of_urdf
 from stitch.session.robot import Robot, forward
 
@@ -277,7 +276,7 @@ def with_uncoupled_joints(reading: Reading, urdf: Path | None) -> Reading:
         ways = [*joint_readings(layout, urdf, None), *_uncoupled(layout, urdf, None)]
     except InputError:
         return reading  # joints of another arm
-    turned, *others = (rotation_angles(frames.inverse(T[:-1]) @ T[1:]) for T in (reading.T, *(way.T for way in ways)))
+    turned, *others = (frames.angle_between(T[:-1], T[1:]) for T in (reading.T, *(way.T for way in ways)))
     off = [float(np.abs(other - turned).max()) for other in others]
     best = ways[int(np.argmin(off))]
     if min(off) > _TURNS_ALIKE or not best.variant:

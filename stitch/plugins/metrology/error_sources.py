@@ -149,7 +149,7 @@ def error_chain(run: RunData) -> ErrorChain:
     centre = unconstrained.overlaps.gram.centre
     follow = _follow_overlaps(run, capture, solution, centre)
     of_views = np.column_stack(
-        [hand_eye_jacobian(part.hand_eye_frames, centre), columns[:, fitted] * ~of_points[fitted]]
+        [hand_eye_jacobian(part.capture, part.T_mount, centre), columns[:, fitted] * ~of_points[fitted]]
     )
     by_points = np.column_stack([np.zeros((len(columns), 6)), columns[:, fitted] * of_points[fitted]])
     return ErrorChain(

@@ -13,8 +13,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.plugins.metrology.features import NUMBERS, Feature, nearest_on_mesh
-from stitch.session.reading.robot_description import require_known_keys
-from stitch.session.reading.text_files import read_toml, reason_of, shortened
+from stitch.session.reading.text_files import read_toml, reason_of, require_known_keys, shortened
 
 # Points count within so many spacings of the nominal surface, and a patch is so wide, where nobody says so.
 _WITHIN = 10.0

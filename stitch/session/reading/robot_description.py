@@ -5,7 +5,6 @@ A wrong number would move the arm without a word. URDF counts in metres and radi
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.session.reading.text_files import require_file, shortened
+from stitch.session.reading.text_files import require_file, require_known_keys, shortened
 from stitch.session.robot import LinkMesh, Robot, elementary
 
 Element = ElementTree.Element
@@ -109,26 +108,6 @@ def _point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
     if mass < 0:
         raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
     return mass, table_numbers(where, table, "com", (3,))
-
-
-def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
-    """Refuse a table with a key that is not known: a misspelt alpha_deg would silently count as 0.
-
-    Args:
-        where: names the table in the message.
-
-    Raises:
-        InputError: names the key, and the known one that is most like it.
-    """
-    if not isinstance(table, dict):
-        raise InputError(
-            f"{where}: {shortened(table)} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}"
-        )
-    for key in table:
-        if key not in known:
-            close = get_close_matches(str(key), known, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
-            raise InputError(f"{where}: unknown key {shortened(key)}; {hint}")
 
 
 def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:

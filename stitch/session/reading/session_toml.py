@@ -2,8 +2,6 @@
 
 import re
 import shlex
-from collections.abc import Collection
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -16,7 +14,6 @@ from stitch.numerics.units import METRES
 from stitch.session.axes import KINDS, Axis
 from stitch.session.reading.robot_description import (
     LARGEST,
-    require_known_keys,
     robot_from_dh,
     robot_from_urdf,
     table_numbers,
@@ -25,6 +22,7 @@ from stitch.session.reading.text_files import (
     optional_text,
     read_toml,
     require_folder_name,
+    require_known_keys,
     require_name,
     shortened,
     table_choice,
@@ -33,12 +31,13 @@ from stitch.session.robot import Robot
 from stitch.session.session import Scanner, SensorKind, StatedRepeatability
 
 SESSION_FORMAT = "stitch-session/1"
-_KEYS = {
-    "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part", "axis"},
-    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving", "name"},
-    "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
-    "sphere": {"radius"},
-    "part": {"cad", "cad_unit"},
+# Keys by the table that they stand in; "" for the document itself.
+TABLE_KEYS = {
+    "": ("format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part", "axis"),
+    "scanner": ("pose", "noise", "standoff", "optical_axis", "kind", "within", "moving", "name"),
+    "robot": ("name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"),
+    "sphere": ("radius",),
+    "part": ("cad", "cad_unit"),
 }
 _AXIS_KEYS = ("name", "kind", "carries", "direction", "point", "stated")
 # What an axis may carry beside a robot that carries the scanner, or the part, and without a robot.
@@ -67,9 +66,8 @@ def read_session_document(file: Path) -> dict[str, Any]:
     document = read_toml(file, hint)
     if document.get("format") != SESSION_FORMAT:
         raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{SESSION_FORMAT}"')
-    for table, known in _KEYS.items():
-        entries = document if not table else document.get(table, {})
-        _require_entries(file, table, entries, known)
+    for table, known in TABLE_KEYS.items():
+        require_known_keys(file, document if not table else document.get(table, {}), known, table)
     return document
 
 
@@ -84,43 +82,6 @@ def usual_guesses(file: Path, document: dict[str, Any]) -> dict[str, str]:
     """
     found = re.findall(r"^# \? (\w+): ([^;,\n]+)", file.read_text(encoding="utf-8"), re.MULTILINE)
     return {what: value for what, value in found if document.get(what, value) == value}
-
-
-def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = ()) -> None:
-    """Refuse a table as of session.toml that has unknown keys.
-
-    Args:
-        file: for messages.
-        name: of the table, a key of `_KEYS`.
-        table: its content.
-        without: keys that are known in session.toml, and refused here.
-
-    Raises:
-        InputError: no table, or such a key.
-    """
-    _require_entries(file, name, table, _KEYS[name].difference(without))
-
-
-def _require_entries(file: Path, table: str, entries: Any, known: Collection[str]) -> None:
-    """Refuse what is no table, or one with an unknown key.
-
-    Args:
-        table: its name; empty: the document itself.
-        entries: its content.
-        known: keys.
-
-    Raises:
-        InputError: names the key, and the known one that is most like it.
-    """
-    if not isinstance(entries, dict):
-        raise InputError(f"{file}: [{table}] must be a table")
-    for key in map(str, entries):
-        if key not in known:
-            close = get_close_matches(key, known, 1)
-            raise InputError(
-                f"{file}: unknown key {f'{table}.{key}' if table else key!r}"
-                + (f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}")
-            )
 
 
 def session_name(file: Path, document: dict[str, Any]) -> str:
@@ -218,8 +179,8 @@ def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
     if not isinstance(name, str) or not _AXIS_NAME.fullmatch(name):
         raise InputError(f'{file}: {where} needs a name of letters and digits; to fix: write name = "table"')
     where = f"{file}: axis {name}"
-    kind = _one_of(where, table, "kind", KINDS)
-    carries = _one_of(where, table, "carries", _CARRIED[mount])
+    kind = table_choice(where, table, "kind", KINDS)
+    carries = table_choice(where, table, "carries", _CARRIED[mount])
     direction = None
     if "direction" in table:
         direction = table_numbers(where, table, "direction", (3,))
@@ -237,19 +198,6 @@ def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
         needs = "direction and point" if axis.is_rotary else "a direction"
         raise InputError(f"{where}: stated = true needs {needs}; to fix: write them, or leave stated out")
     return axis
-
-
-def _one_of(where: str, table: dict[str, Any], key: str, choices: Collection[str]) -> str:
-    """Return the value at `key` of a table, which has to be one of some words.
-
-    Raises:
-        InputError: it is none of them.
-    """
-    value = table.get(key)
-    if value not in tuple(choices):
-        words = " or ".join(f'"{choice}"' for choice in choices)
-        raise InputError(f"{where}: {key} is {shortened(value)}; here it is {words}")
-    return str(value)
 
 
 def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:

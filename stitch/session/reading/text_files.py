@@ -6,12 +6,12 @@ What it holds as TOML, JSON or sheets; names that people write there; and values
 import codecs
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 
 # Tables and descriptions are far smaller; a larger one is another file.
 LARGEST_MB = 200
@@ -174,15 +174,38 @@ def read_toml(file: Path, hint: str) -> dict[str, Any]:
         raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
 
 
-def table_choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
+def require_known_keys(where: Path | str, table: Any, known: Collection[str], name: str = "") -> None:
+    """Refuse a table with a key that is not known: a misspelt alpha_deg would silently count as 0.
+
+    Args:
+        where: file, and place in it, for the message.
+        known: keys, at best in the order in which people write them.
+        name: of the table, which stands before its keys in the message; empty: it has none.
+
+    Raises:
+        InputError: names the key, and the known one that is most like it.
+    """
+    if not isinstance(table, dict):
+        what = f"{name} = {shortened(table)}" if name else shortened(table)
+        raise InputError(f"{where}: {what} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}")
+    for key in map(str, table):
+        if key not in known:
+            hint = did_you_mean(key, known) or f"; known are {', '.join(known)}"
+            raise InputError(f"{where}: unknown key {shortened(f'{name}.{key}' if name else key)}{hint}")
+
+
+def table_choice(where: Path | str, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
     """Return the word at `key`, one of those allowed.
+
+    Args:
+        where: file, and place in it, for the message.
 
     Raises:
         InputError: another one, or none.
     """
     value = table.get(key)
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(f"{file}: {key} is {shortened(value)}; use {' or '.join(repr(a) for a in allowed)}")
+        raise InputError(f"{where}: {key} is {shortened(value)}; use {' or '.join(repr(a) for a in allowed)}")
     return str(value)
 
 

@@ -150,7 +150,7 @@ def test_pair_equations_are_the_finite_differences_of_the_cost(blade_capture, ov
 def test_the_hand_eye_jacobian_is_a_finite_difference(blade_capture):
     measured, capture = blade_capture
     centre, step = np.array([10.0, -5, 30]), 1e-6
-    J = hand_eye_jacobian(capture.poses(measured.T_mount), centre).reshape(-1, 6, 6)
+    J = hand_eye_jacobian(capture, measured.T_mount, centre).reshape(-1, 6, 6)
     to_centre = frames.make(np.eye(3), -centre)
     for i in range(6):
         moved = capture.poses(measured.T_mount @ frames.exp(step * np.eye(6)[i]))

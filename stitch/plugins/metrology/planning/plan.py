@@ -95,7 +95,7 @@ class PossibleViews:
         covariance += noise_of(information, sizes[2] * g.variance, max(g.lever, 1e-9))
         used = view_columns(m, model, unconstrained) * sizes_of(model.terms)
         common = np.tile(np.eye(6), (g.views, 1))
-        hand_eye = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
+        hand_eye = hand_eye_jacobian(m.capture, model.T_mount, g.centre)
         return TwistChannel(covariance, np.hstack([hand_eye, common, used, *columns]))
 
     def effect(self, name: str) -> tuple[Array, Array, Array]:
