@@ -55,9 +55,9 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     recording.log(f"{WHERE}/zero", rr.LineStrips2D([zero], colors=[_AXIS], radii=rr.Radius.ui_points(0.7)), static=True)
     follows = "views in their order" if course["follows"] == "view order" else covariate_text(course["follows"])
     along = f"{follows} ({course['unit']})" if course["unit"] else follows
-    _label(
-        recording, "title", [(_LEFT + _WIDE / 2, -_ABOVE)], [f"how far {course['of']} is off ({unit}), over {along}"]
-    )
+    verb = "are" if course["of"].endswith("views") else "is"
+    title = f"how far {course['of']} {verb} off ({unit}), over {along}"
+    _label(recording, "title", [(_LEFT + _WIDE / 2, -_ABOVE)], [title])
     heights = round_marks(low, high, 4)
     texts = [f"{h:+.3g}" if h else "0" for h in heights]
     _label(recording, "heights", np.column_stack([np.full(len(heights), _LEFT / 2), to_y(heights)]), texts)

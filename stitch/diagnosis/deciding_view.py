@@ -14,7 +14,6 @@ A further view is counted in the frame of the views that there are: less the mea
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -78,15 +77,6 @@ _WAITS = (0.0, 0.5, 1.0, 2.0)
 
 
 @dataclass(frozen=True)
-class DecidingViews:
-    """Further views in the order in which they are taken."""
-
-    joints: Array  # (K, n) rad
-    wait: Array  # (K,) s after the last view that there is, beside the usual pause
-    probability: Array  # (K,) that the true rival is named after the view and those before it
-
-
-@dataclass(frozen=True)
 class Prediction:
     """What a rival predicts that N further views show: m numbers each, jointly normal, their covariance in three parts.
 
@@ -124,8 +114,8 @@ class Prediction:
 
 
 def deciding_views(
-    linear: LinearModel, rivals: Sequence[Ranked], most: int = MOST_VIEWS, undecided: int = 0
-) -> DecidingViews | None:
+    linear: LinearModel, rivals: Sequence[Ranked], undecided: int = 0
+) -> tuple[Array, Array, Array] | None:
     """Return the further views after which one of the rivals is most likely named; None where no pose tells them apart.
 
     Views are chosen among poses near those driven, from which the scanner sees the part as it has before; then again
@@ -133,9 +123,12 @@ def deciding_views(
 
     Args:
         rivals: effects, as they are ranked beside each other.
-        most: number of views at the most.
         undecided: number of rivals, the first ones, between which the verdict did not decide. Where their evidence
             would have decided, the verdict overruled it: then they are taken for equally likely.
+
+    Returns:
+        Of up to `MOST_VIEWS` views in the order in which they are taken: joints (K, n), rad; waits (K,), s after the
+        last view that there is, beside the usual pause; probabilities (K,) that the true rival is named by then.
     """
     scores = [ranked.score for ranked in rivals]
     if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
@@ -155,12 +148,12 @@ def deciding_views(
     if not len(joints):
         return None
     forms = competing_forms(scores, log_weights, [ranked.log_belief for ranked in rivals], unnamed)
-    first, share_alone = _choose(linear, forms, joints, most)
+    chosen, _, _, share_alone = _choose(linear, forms, joints)
     best = joints[np.argsort(-share_alone, kind="stable")[:_BEST]]
     close_to_best = possible_joints(linear, best)[:_CLOSE_TO_BEST]
-    refined = np.concatenate([best, first.joints, close_to_best])
-    views, _ = _choose(linear, forms, np.unique(refined.round(9), axis=0), most)
-    return views if len(views.joints) else None
+    refined = np.unique(np.concatenate([best, joints[chosen], close_to_best]).round(9), axis=0)
+    chosen, wait, probability, _ = _choose(linear, forms, refined)
+    return (refined[chosen], wait[chosen], probability) if chosen else None
 
 
 def unnamed_joints(linear: LinearModel, scores: Sequence[Score]) -> list[tuple[JointEffect, float]]:
@@ -187,7 +180,6 @@ class RivalForms:
     log_weights: Array  # (F,) log posterior by the views taken, not normalised
     rival: Indices  # (F,) index of the rival whose form it is
     log_belief: Array  # (R,) how often each rival is met, a judgement that decides nothing by itself
-    named: int  # number of rivals that have a name, the first ones
 
     def margins(self, log_posteriors: Array) -> Array:
         """Return (R, …) by how many nats each rival is ahead of the nearest other one, from log posteriors (R, …).
@@ -234,10 +226,10 @@ def competing_forms(
     rival += [len(scores)] * len(unnamed)
     belief = np.zeros(max(rival) + 1)
     belief[: len(log_belief)] = log_belief
-    return RivalForms(forms, np.array(weights), np.array(rival), belief, len(scores))
+    return RivalForms(forms, np.array(weights), np.array(rival), belief)
 
 
-def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) -> tuple[DecidingViews, Array]:
+def _choose(linear: LinearModel, forms: RivalForms, joints: Array) -> tuple[list[int], Array, Array, Array]:
     """Return the views that decide best, chosen one after the other, and how much each view decides alone.
 
     The measure is the probability that the true rival will have, on average over what the view may show. Choosing ends
@@ -245,10 +237,10 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) ->
 
     Args:
         joints: (N, n) rad, of the views to choose from.
-        most: number of views at the most.
 
     Returns:
-        The views; and (N,) the measure after each view alone.
+        The indices of the K chosen views; (N,) s, how long is waited before each view; (K,) the probability that the
+        true rival is named after each chosen one; and (N,) the measure after each view alone.
     """
     wait = _waits(linear, forms.scores, len(joints))
     predictions = predict_views(linear, forms.scores, joints, wait)
@@ -261,35 +253,27 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array, most: int) ->
     chosen = list[int]()
     probability = list[float]()
     share_alone = np.zeros(len(joints))
-    while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
+    while len(chosen) < min(MOST_VIEWS, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
-        shares = _simulate_decisions(predictions, forms, chosen, indices, draws).share
+        _, shares = _simulate_decisions(predictions, forms, chosen, indices, draws)
         shares[chosen] = -1.0
         if not chosen:
             share_alone = shares
         k = int(shares.argmax())
         more_draws = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
-        decisions = _simulate_decisions(predictions, forms, chosen, indices[k : k + 1], more_draws)
-        if decisions.share[0] < true_share + _WORTH:
+        (named,), (share,) = _simulate_decisions(predictions, forms, chosen, indices[k : k + 1], more_draws)
+        if share < true_share + _WORTH:
             break
         chosen.append(k)
-        probability.append(float(decisions.right[0]))
-        true_share = float(decisions.share[0])
-    return DecidingViews(joints[chosen], wait[chosen], np.array(probability)), share_alone
-
-
-class _Decisions(NamedTuple):
-    """What C sets of views will decide, (C,) each, on average over the rivals and over what the views may show."""
-
-    right: Array  # probability that the true rival is named
-    wrong: Array  # probability that another one is named
-    share: Array  # posterior probability of the true rival
+        probability.append(float(named))
+        true_share = float(share)
+    return chosen, wait, np.array(probability), share_alone
 
 
 def _simulate_decisions(
     predictions: Sequence[Prediction], forms: RivalForms, chosen: Sequence[int], last: Indices, draws: Array
-) -> _Decisions:
-    """Return what will be decided after C sets of views, by simulation; each is the chosen views and one of `last`.
+) -> tuple[Array, Array]:
+    """Return what C sets of views will decide, by simulation; each is the chosen views and one of `last`.
 
     Each form in turn is taken for the true one, as often as its weight says: what a set shows is drawn from its
     prediction, and held against the predictions of all forms.
@@ -299,6 +283,10 @@ def _simulate_decisions(
         chosen: indices of the views that are in every set.
         last: (C,) index of the last view of each set.
         draws: (S, D) standard normal numbers, from which the D numbers that a set shows are drawn S times.
+
+    Returns:
+        (C,) the probability that the true rival is named, and (C,) its posterior probability; on average over the
+        rivals and over what the views may show.
     """
     sets = [prediction.of_sets(chosen, last) for prediction in predictions]
     means = [mean for mean, _ in sets]
@@ -310,7 +298,7 @@ def _simulate_decisions(
     weights = np.exp(forms.log_weights - forms.log_weights.max())
     weights = weights / weights.sum()
     rivals = range(int(forms.rival.max()) + 1)
-    right, wrong, share = np.zeros((3, len(last)))
+    right, share = np.zeros((2, len(last)))
     for weight, true, true_mean, root in zip(weights, forms.rival, means, roots, strict=True):
         drawn = true_mean[:, None] + draws @ root.transpose(0, 2, 1)  # (C, S, D)
         whitened = ((drawn - mean[:, None]) @ whitener for mean, whitener in zip(means, whiteners, strict=True))
@@ -319,10 +307,8 @@ def _simulate_decisions(
         log_posteriors = np.array([np.logaddexp.reduce(of_forms[forms.rival == r], axis=0) for r in rivals])
         decided = forms.margins(log_posteriors) > ODDS
         right += weight * decided[true].mean(axis=1)
-        others = [r for r in range(forms.named) if r != true]
-        wrong += weight * decided[others].any(axis=0).mean(axis=1)
         share += weight * np.exp(log_posteriors[true] - np.logaddexp.reduce(log_posteriors, axis=0)).mean(axis=1)
-    return _Decisions(right, wrong, share)
+    return right, share
 
 
 def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
@@ -417,8 +403,8 @@ def predict_views(
     """
     match linear.observation:
         case SurfaceObservation() as surfaces:
-            further = _FurtherScans.of(linear, surfaces, joints, wait)
-            return [_predict_scans(linear, scored, further) for scored in scores]
+            scans = _further_scans(linear, surfaces, joints, wait)
+            return [_predict_scans(linear, scored, scans) for scored in scores]
         case ReducedRows(rows=TargetRows()) as observation:
             named = [scored for scored in scores if isinstance(scored, Score)]
             return _predict_targets(linear, observation, named, joints, wait)
@@ -427,42 +413,33 @@ def predict_views(
 
 @dataclass(frozen=True)
 class _FurtherScans:
-    """V views of surfaces that were taken, and N further ones."""
+    """N further views of surfaces, and the V that were taken.
 
-    surfaces: SurfaceObservation
-    measurement: Measurement  # of all V + N views
-    errors: PoseErrors | None  # of all their twists, not reduced; None: no prior
-    flange: Array  # (V + N, 6, 6) adjoints: from a twist of the flange to the view's about the surface's centre
+    Twists of all views are six rows a view, those taken first: left twists of the pose about the surface's centre,
+    reference frame, rotation first; rad and length_unit.
+    """
 
-    @classmethod
-    def of(cls, linear: LinearModel, surfaces: SurfaceObservation, joints: Array, wait: Array) -> "_FurtherScans":
-        """Return further views at joint angles (N, J), rad, after waits (N,), s, beside those of a linear model."""
-        further = candidate_measurement(linear.measurement, joints, wait)
-        both = with_candidates(linear.measurement, further)
-        errors = None
-        if linear.pose_errors is not None:
-            errors = prior_pose_errors([both], linear.model, [surfaces.centre])
-            errors = _with_drift(errors, both, linear.measurement, surfaces.centre)
-        to_centre = frames.make(np.eye(3), -surfaces.centre)
-        flange = frames.adjoint(to_centre @ both.capture.T_reference_flange)
-        return cls(surfaces, both, errors, flange)
+    surfaces: SurfaceObservation  # of the views taken
+    measurement: Measurement  # of all views
+    columns: Array  # (6 (V + N), a) twists per unit of hand-eye and effects in use
+    errors: PoseErrors | None  # of all twists; None: no prior
+    flange: Array  # (V + N, 6, 6) adjoints, from a twist of the flange to that of the view
 
-    @property
-    def taken_rows(self) -> int:
-        """6V, the number of rows of the views that were taken."""
-        return len(self.surfaces.reduced_poses.reduction[0])
+    def beside_taken(self, rows: Array) -> Array:
+        """Return the rows (6N, P) of the further views less the mean over those taken, of all rows (6 (V + N), P).
 
-    def relative(self, columns: Array) -> Array:
-        """Return the twists (6N, P) of further views less the mean of those taken, from all of them (6 (V + N), P)."""
-        mean = columns[: self.taken_rows].reshape(-1, 6, columns.shape[1]).mean(axis=0)
-        return columns[self.taken_rows :] - np.tile(mean, ((len(columns) - self.taken_rows) // 6, 1))
+        That mean moves all views together, which no overlap shows.
+        """
+        of_views = rows.reshape(len(self.flange), 6, -1)
+        taken = len(self.surfaces.reduced_poses.reduction[0]) // 6
+        return (of_views[taken:] - of_views[:taken].mean(axis=0)).reshape(-1, rows.shape[1])
 
-    def covariance(self, base: LinearModel, unnamed: JointEffect | None) -> Array:
-        """Return the covariance (6 (V + N), 6 (V + N)) of the twists of all views by pose errors and scatter.
+    def error_covariance(self, base: LinearModel, unnamed: JointEffect | None) -> Array:
+        """Return the covariance (6 (V + N), 6 (V + N)) of all twists by scatter of the flange and by pose errors.
 
         Args:
-            base: the model with their variances.
-            unnamed: a joint without a law whose errors are among them, the last variance; None: none is.
+            base: the model with the variances of these.
+            unnamed: a joint without a law, whose variance is the last one of `base`; None: none is there.
         """
         variances = base.null.variances
         n = 6 * len(self.flange)
@@ -471,33 +448,40 @@ class _FurtherScans:
         white = np.repeat(np.maximum(variances[:NOISE], 1e-300), 3)
         blocks[each, :, each] = (self.flange * white) @ self.flange.transpose(0, 2, 1)
         out = blocks.reshape(n, n)
-        if self.errors is not None and base.pose_errors is not None:
-            components = self.errors.restricted(base.pose_errors.causes).components
-            if unnamed is not None:
-                components = np.concatenate([components, self._of_joint(unnamed)[None]])
-            out = out + np.einsum("c,cij->ij", variances[NOISE + 1 :], components)
-        return out
-
-    def _of_joint(self, unnamed: JointEffect) -> Array:
-        """Return the covariance (6 (V + N), 6 (V + N)) of all twists by a joint without a law.
-
-        Its random function, of variance 1, is found again among those of all views by the joints that it follows.
-        """
-        assert self.errors is not None
-        of_taken, of_all = unnamed.errors, self.errors.joint_processes[unnamed.follows]
-        joints = of_taken.joints[unnamed.process], of_taken.others[unnamed.process] if of_taken.others else None
-        pairs = list(zip(of_all.joints, of_all.others or (None,) * len(of_all.joints), strict=True))
-        return of_all.twist_covariance(pairs.index(joints))
+        if self.errors is None or base.pose_errors is None:
+            return out
+        components = self.errors.restricted(base.pose_errors.causes).components
+        if unnamed is not None:
+            # Its random function of variance 1 is found again, by the joints that it follows, among those of all views.
+            of_taken, of_all = unnamed.errors, self.errors.joint_processes[unnamed.follows]
+            joints = of_taken.joints[unnamed.process], of_taken.others[unnamed.process] if of_taken.others else None
+            pairs = list(zip(of_all.joints, of_all.others or (None,) * len(of_all.joints), strict=True))
+            components = np.concatenate([components, of_all.twist_covariance(pairs.index(joints))[None]])
+        return out + np.einsum("c,cij->ij", variances[NOISE + 1 :], components)
 
     def noise(self, base: LinearModel) -> Array:
         """Return the covariance (6, 6) of a further view's twist by noise of the surfaces: the mean of views taken."""
-        expansion = self.surfaces.reduced_poses.expansion
+        reduced = self.surfaces.reduced_poses
         noise = base.mixed.components[NOISE, 0] * base.null.variances[NOISE]
         if base.mixed.fixed is not None:
             noise = noise + base.mixed.fixed[0]
-        blocks = (expansion @ noise @ expansion.T).reshape(-1, 6, self.taken_rows // 6, 6)
+        covariance = reduced.expansion @ noise @ reduced.expansion.T
+        blocks = covariance.reshape(-1, 6, len(covariance) // 6, 6)
         each = np.arange(len(blocks))
         return np.asarray(blocks[each, :, each].mean(axis=0))
+
+
+def _further_scans(linear: LinearModel, surfaces: SurfaceObservation, joints: Array, wait: Array) -> _FurtherScans:
+    """Return further views at joint angles (N, n), rad, after waits (N,), s, beside those of a linear model."""
+    both = with_candidates(linear.measurement, candidate_measurement(linear.measurement, joints, wait))
+    errors = None
+    if linear.pose_errors is not None:
+        errors = prior_pose_errors([both], linear.model, [surfaces.centre])
+        errors = _with_drift(errors, both, linear.measurement, surfaces.centre)
+    hand_eye = hand_eye_jacobian(both.capture, linear.model.T_mount, surfaces.centre)
+    columns = np.hstack([hand_eye, _used_columns(linear, both, surfaces.centre)])
+    to_centre = frames.make(np.eye(3), -surfaces.centre)
+    return _FurtherScans(surfaces, both, columns, errors, frames.adjoint(to_centre @ both.capture.T_reference_flange))
 
 
 def _with_drift(errors: PoseErrors, both: Measurement, taken: Measurement, centre: Array) -> PoseErrors:
@@ -514,44 +498,54 @@ def _with_drift(errors: PoseErrors, both: Measurement, taken: Measurement, centr
     return replace(errors, components=components)
 
 
-def _predict_scans(linear: LinearModel, scored: Score | JointEffect, scans: _FurtherScans) -> Prediction:
-    """Return a rival's prediction of the poses of further views: left twists about the surface's centre, m = 6.
+def _predict_scans(linear: LinearModel, rival: Score | JointEffect, scans: _FurtherScans) -> Prediction:
+    """Return what a rival predicts of the twists of further views beside the mean of those taken, m = 6.
+
+    The twists of all views are columns · coefficients + errors, the errors jointly normal. What the views taken show
+    gives the coefficients, and a part of the errors (`_condition_on_views`).
 
     Args:
-        scored: the rival: an effect as the views taken fit it, or a joint without a law.
-        scans: the further views, beside those taken.
+        rival: an effect as the views taken fit it, or a joint without a law.
     """
-    unnamed = scored if isinstance(scored, JointEffect) else None
-    base = scored.model if isinstance(scored, JointEffect) else model_beside(linear, scored)
-    measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre
-    hand_eye = hand_eye_jacobian(measurement.capture, bare.T_mount, centre)
-    all_columns = [hand_eye, _used_columns(linear, scans)]
-    if isinstance(scored, Score):
-        all_columns.append(_twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep])
-    columns = scans.relative(np.hstack(all_columns))
-    covariance = scans.covariance(base, unnamed)
-    with_taken = scans.relative(covariance[:, : scans.taken_rows] @ scans.surfaces.reduced_poses.reduction.T)
-    among_further = scans.relative(scans.relative(covariance).T)
+    if isinstance(rival, JointEffect):
+        base, unnamed, columns = rival.model, rival, scans.columns
+    else:
+        base, unnamed = model_beside(linear, rival), None
+        bare = Model(linear.model.T_mount)
+        by_rival = _twists(scans.measurement, bare, zero_term(rival), scans.surfaces.centre)[:, rival.form.keep]
+        columns = np.hstack([scans.columns, by_rival])
+    columns = scans.beside_taken(columns)
+    covariance = scans.error_covariance(base, unnamed)
+    reduction = scans.surfaces.reduced_poses.reduction
+    with_taken = scans.beside_taken(covariance[:, : reduction.shape[1]] @ reduction.T)
+    among_further = scans.beside_taken(scans.beside_taken(covariance).T)
+    mean, root, explained = _condition_on_views(base, rival, columns, with_taken)
     N = len(columns) // 6
-    per_view = np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6))
-    mean, root, explained = _condition_on_views(base, scored, columns, with_taken)
-    shared = (among_further - explained).reshape(N, 6, N, 6)
-    design = columns[:, : base.white_design.shape[1]].reshape(N, 6, -1)
-    return Prediction(mean.reshape(N, 6), root.reshape(N, 6, -1), shared, per_view, design)
+    return Prediction(
+        mean.reshape(N, 6),
+        root.reshape(N, 6, -1),
+        shared=(among_further - explained).reshape(N, 6, N, 6),
+        per_view=np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6)),
+        design=columns[:, : base.white_design.shape[1]].reshape(N, 6, -1),
+    )
 
 
-def _used_columns(linear: LinearModel, scans: _FurtherScans) -> Array:
-    """Return the derivatives (6 (V + N), a − 6) of the twists of all views by the effects in use.
+def _used_columns(linear: LinearModel, both: Measurement, centre: Array) -> Array:
+    """Return the twists (6 (V + N), a − 6) of all views per unit of the effects in use.
 
     Columns of the fit are found again, by value, among those of each effect. Effects that change points have zeros in
     further views: these have no points.
+
+    Args:
+        both: measurement of the V views taken and the N further ones.
+        centre: (3,) of the surface, reference frame.
     """
     design = linear.design[:, 6:]
-    out = np.vstack([design, np.zeros((6 * len(scans.flange) - len(design), design.shape[1]))])
+    out = np.vstack([design, np.zeros((6 * both.views.count - len(design), design.shape[1]))])
     for term in linear.model.terms:
         if moves_points([term]):
             continue
-        twists = _twists(scans.measurement, linear.model, term, scans.surfaces.centre)
+        twists = _twists(both, linear.model, term, centre)
         for j, column in enumerate(design.T):
             distance = np.linalg.norm(twists[: len(design)] - column[:, None], axis=0)
             if len(distance) and distance.min() < 1e-6 * np.linalg.norm(column):

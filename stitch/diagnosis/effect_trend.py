@@ -72,23 +72,15 @@ def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[s
     effects = [fit_effect(fitted, scored, again) for scored, again in pairs]
     if moves_points([effects[0].term]):
         return trends_of_points(fitted, effects, [again for _, again in pairs])
-    plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_axes(fitted, effects[0]))
-    return {} if plot is None else {effect.term.name: _trend_in_plot(plot, effect) for effect in effects}
-
-
-@dataclass(frozen=True)
-class ExpectedView:
-    """Where rival effects expect the dot of one further view; units as in their trends."""
-
-    at: float  # horizontal
-    sigma: float  # by which the dot of one view scatters
-    expected: dict[str, tuple[float, float]]  # by effect: vertical, and the standard deviation of what would be seen
+    axes = _axes(fitted, effects[0])
+    plot = _Plot(fitted, model_beside(linear, pairs[0][0]), *axes)
+    return {effect.term.name: _trend_in_plot(plot, effect) for effect in effects} if plot.moves_views else {}
 
 
 def expected_in_view(
     linear: LinearModel, rivals: Sequence[Score], joints: Array, wait: float = 0.0
-) -> ExpectedView | None:
-    """Return where each of several rival effects predicts the dot of one further view, in their common plot.
+) -> tuple[float, float, dict[str, tuple[float, float]]] | None:
+    """Return where each of several rival effects expects the dot of one further view, in their common plot.
 
     None where that cannot be computed: for labelled points, effects that change points, and dots drawn along gravity.
 
@@ -96,6 +88,10 @@ def expected_in_view(
         rivals: scores of the effects; the first chooses direction and axis, as in the plot.
         joints: (n,) joint angles of the view, rad.
         wait: s, beside the usual pause before the view.
+
+    Returns:
+        The dot's place along the horizontal axis; the standard deviation of a dot by scatter of the flange; and by
+        effect, the height that it expects, with the standard deviation of what would be seen. Units as in the trends.
     """
     fitted = linear.restricted(())
     surfaces = surfaces_of(fitted)
@@ -106,38 +102,32 @@ def expected_in_view(
     motion, (follows, _, _) = _axes(fitted, effect)
     if "gravity" in follows:
         return None
-    measurement = candidate_measurement(linear.measurement, joints[None], wait)
-    at = float(_axis(measurement.views, effect.term, motion)[2][0])
-    if follows == "time":
-        at = float(measurement.views.time[0])
-    elif follows == "view order":
-        at = float(linear.measurement.views.count)
-    # Twists count as displacements: rotations (rad) times the part's reach. `projection` is the row that takes a twist
-    # to its multiple of the unit motion.
+    further = candidate_measurement(linear.measurement, joints[None], wait)
+    match follows:
+        case "time":
+            at = further.views.time[0]
+        case "view order":
+            at = linear.measurement.views.count
+        case _:
+            at = _axis(further.views, effect.term, motion)[2][0]
+    # Twists count as displacements: rotations (rad) times the part's reach. The height of a twist is its product with
+    # the unit motion, over that motion's square, so that the unit motion itself has the height 1.
     to_displacement = np.repeat([surfaces.reach, 1.0], 3)
-    unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * to_displacement
-    projection = unit * to_displacement / max(float(unit @ unit), 1e-300)
+    unit = _unit_twist(fitted, motion, further, surfaces.centre) * to_displacement
+    to_height = unit * to_displacement / max(float(unit @ unit), 1e-300)
     # A dot is what the model without any candidate leaves: its prediction is subtracted from the rivals'.
     without = fitted.baseline_trial.solve()
     expected = {}
     for scored, prediction in zip(rivals, predict_views(linear, rivals, joints[None], np.array([wait])), strict=True):
         mean, covariance = prediction.of_sets([], np.zeros(1, np.int64))
-        value = projection @ (mean[0] - prediction.design[0] @ without)
-        expected[scored.name] = (float(value), float(np.sqrt(projection @ covariance[0] @ projection)))
-    scatter = _view_scatter(linear, rivals[0], measurement)
-    return ExpectedView(at, float(np.sqrt(projection @ scatter @ projection)), expected)
-
-
-def _view_scatter(linear: LinearModel, scored: Score, measurement: Measurement) -> Array:
-    """Return the covariance (6, 6) of a further view's twist by the flange's scatter, with a candidate in the model.
-
-    The twist is about the part's centre, reference frame, rotation first; rad and length_unit.
-    """
-    base = model_beside(linear, scored)
-    flange = build_capture("candidate", (), measurement.T_base_flange, measurement.mount).T_reference_flange
-    carried = frames.adjoint(frames.make(np.eye(3), -base.observation.centre) @ flange)[0]
+        height = to_height @ (mean[0] - prediction.design[0] @ without)
+        expected[scored.name] = (float(height), float(np.sqrt(to_height @ covariance[0] @ to_height)))
+    # Scatter moves a view by a twist of the flange, carried to the surface's centre.
+    base = model_beside(linear, rivals[0])
+    flange = build_capture("candidate", (), further.T_base_flange, further.mount).T_reference_flange
+    by_flange = to_height @ frames.adjoint(frames.make(np.eye(3), -base.observation.centre) @ flange)[0]
     variances = np.repeat(np.maximum(base.flange_scatter(base.null), 1e-300), 3)
-    return np.asarray(carried * variances @ carried.T)
+    return float(at), float(np.sqrt(by_flange**2 @ variances)), expected
 
 
 def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement, centre: Array) -> Array:
@@ -178,11 +168,10 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=observed))
     effect = FittedEffect(term, form, fit_change(without, form.columns, without))
     axes = _axes(without, _clearest_joint(effect))
-    plot = _plot(without, linear, *axes)
-    with_effect = _plot(replace(fitted, design=np.hstack([without.design, form.response])), linear, *axes)
-    if plot is None or with_effect is None:
+    with_effect = _Plot(replace(fitted, design=np.hstack([without.design, form.response])), linear, *axes)
+    if not with_effect.moves_views:
         return None
-    return _trend_in_plot(replace(plot, after=with_effect.measured), effect)
+    return _trend_in_plot(_Plot(without, linear, *axes, after=with_effect.measured), effect)
 
 
 def _clearest_joint(effect: FittedEffect) -> FittedEffect:
@@ -251,9 +240,9 @@ def _trend_of_joint(
     response = turned * _repeat_for_rows(fitted, shapes, len(turned))
     per_unit = _displacements(fitted, turned)[..., 0]
     motion = _Motion(f"joint {number}", "rad", per_unit, error[:, None] * per_unit, number - 1)
-    plot = _plot(fitted, scatter, motion, axis)
+    plot = _Plot(fitted, scatter, motion, axis)
     change = fit_change(fitted, fitted.reduce(response), fitted)
-    return None if plot is None else plot.trend(change, motion.of, shapes @ change.values)
+    return plot.trend(change, motion.of, shapes @ change.values) if plot.moves_views else None
 
 
 def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:
@@ -334,11 +323,32 @@ class _Plot:
     """The dots of all views, between a horizontal and a vertical axis; lines of candidates are drawn over them."""
 
     linear: LinearModel  # without any candidate
+    scatter: LinearModel  # with the variances of what is independent between views
     motion: _Motion  # vertical axis
     axis: _Axis  # horizontal axis
-    measured: Array  # (V,) in units of the motion
-    sigma: Array  # (V,)
-    after: Array | None = None  # (V,) with an effect in the model that the dots are without
+    after: Array | None = None  # (V,) dots with an effect in the model that `measured` is without
+
+    @property
+    def moves_views(self) -> bool:
+        """False where the motion moves no view: then nothing can be drawn."""
+        return bool(self.motion.per_unit.any())
+
+    @cached_property
+    def measured(self) -> Array:
+        """(V,) what the model leaves of each view along the motion, in units of it."""
+        linear = self.linear
+        explained = linear.design @ linear.baseline_trial.solve()[-linear.design.shape[1] :]
+        residual = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
+        return self.amounts(residual[:, None])[:, 0]
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(V,) standard deviation of the dots, by what is independent between views."""
+        root = np.linalg.cholesky(_independent_covariance(self.scatter)).astype(float)
+        # With cov = root rootᵀ, sigma² is the sum over columns of `root`. Columns are those of all blocks side by side:
+        # an observation moves views of its own block alone, but for the mean of all.
+        amounts = self.amounts(root.reshape(-1, root.shape[2]))
+        return np.asarray(np.sqrt(np.sum(amounts**2, axis=1)))
 
     def amounts(self, reduced: Array) -> Array:
         """Return by how many units of the motion (V, P) reduced observations (n, P) displace the views, per column."""
@@ -371,27 +381,6 @@ class _Plot:
             after=self.after,
         )
         return trend.with_dots(even_indices(len(at), _MOST_DOTS))
-
-
-def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
-    """Return the dots of a plot: what a model leaves of each view along a motion, with sigma; None if it moves no view.
-
-    Args:
-        linear: the model, without any candidate.
-        scatter: the model with the variances of what is independent between views.
-        motion: vertical axis.
-        axis: horizontal axis.
-    """
-    if not motion.per_unit.any():
-        return None
-    plot = _Plot(linear, motion, axis, np.zeros(0), np.zeros(0))
-    explained = linear.design @ linear.baseline_trial.solve()[-linear.design.shape[1] :]
-    residual = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
-    # With cov = root rootᵀ, sigma² is the sum over columns of `root`. Columns are those of all blocks side by side:
-    # an observation moves views of its own block alone, but for the mean of all.
-    root = np.linalg.cholesky(_independent_covariance(scatter)).reshape(len(residual), -1).astype(float)
-    sigma = np.sqrt(np.sum(plot.amounts(root) ** 2, axis=1))
-    return replace(plot, measured=plot.amounts(residual[:, None])[:, 0], sigma=sigma)
 
 
 def _independent_covariance(linear: LinearModel) -> Array:

@@ -213,18 +213,7 @@ def _fit_law(linear: LinearModel, law: Law, start: Array, scale: float) -> Score
     )
     response = linear.observation.expand(reduced)
     form = Form(Term(effect, parameters), np.ones(len(parameters), bool), response, reduced, law.sizes)
-    trial = try_form(linear, form, start, scale)
-    return Score(
-        Candidate(effect, (form,), None),
-        True,
-        form,
-        trial.p_value,
-        trial.log_bayes_factor,
-        trial.values,
-        trial.covariance,
-        trial.scale,
-        trial.variances,
-    )
+    return try_form(linear, Candidate(effect, (form,), None), form, start, scale)
 
 
 def _no_function(*_: object) -> None:

@@ -32,7 +32,7 @@ from stitch.diagnosis.ranking import (
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, beyond_expected, expected_scatter, implausible, promising, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of
+from stitch.diagnosis.systematic_laws import Dictionary
 from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -66,11 +66,6 @@ class Case(NamedTuple):
 
 # A question; None where it does not arise.
 Question = Callable[[Case, Evidence], Reply | None]
-
-
-def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
-    """Return the effects that would explain the views, and what explains them as well; nothing is left out yet."""
-    return propose(Case(linear, candidates, dictionary_of(linear, candidates)), limit)
 
 
 def propose(case: Case, limit: ScatterLimit) -> Evidence:
@@ -146,7 +141,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         shape = evidence.shape
         assert shape is not None
         formula = shape.score.candidate.effect.formula
-        note = f"what stands out has no known cause: {formula} (p = {shape.adjusted:.1g})"
+        note = f"what stands out, {formula} (p = {shape.adjusted:.1g}), has no known cause"
         return Reply("none that could be named", {"notes": (*evidence.notes, note)}, ends=True)
     first = contenders[0]
     # Random effects of the arm in the model can explain what a further contender would: without those of the known
@@ -232,7 +227,7 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
             beside = rank_one(conditioned_on_effects(case.linear, [second]), best.score.candidate, second.tests)
             pair = (best, second) if beside.log_posterior >= second.log_posterior else (second, beside)
             return Reply(f"not beside {second.name}", both_missing(pair))
-    note = f"{best.name}: an error without a name explains these views as well"
+    note = f"{best.name} explains these views no better than an error without a name"
     return Reply("yes", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
@@ -250,7 +245,7 @@ def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply |
         return Reply("yes")
     if log_bayes_factor > -limits.ODDS:
         return Reply(f"or {trend}", {"rival_trend": trend})
-    note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views better"
+    note = f"{best.name} explains these views less well than an unnamed error, smooth in the joint angles or in time"
     return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
@@ -319,10 +314,10 @@ def _hidden_contenders(case: Case, contenders: Sequence[Ranked]) -> list[Ranked]
 
 
 def _raise_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[Ranked]) -> tuple[Ranked, ...]:
-    """Return the ranking with hidden contenders raised to their new place; all posteriors are normalised again.
+    """Return the ranking with hidden contenders raised to their new place; all posteriors add up to 1 again.
 
-    Ranking and contenders were scored in different models, of which only differences compare: a hidden contender comes
-    as far behind `first` in the ranking as it does among the contenders.
+    The ranking was scored beside random effects of the contenders' names, the contenders without these. So only
+    differences compare: a hidden contender stands as far from `first` in the ranking as it does among the contenders.
 
     Args:
         ranked: all effects as they were ranked, hidden ones too low.
@@ -332,18 +327,18 @@ def _raise_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[
     rescored = {r.name: r for r in contenders}
     first_now = rescored[first.name]
     hidden = [rescored[r.name] for r in ranked if r.name in rescored and not is_contender(r)]
-    differences = {r.name: r.log_posterior - first_now.log_posterior for r in hidden}
-    for difference in differences.values():
-        ranked = rescored_against(ranked, first, first.log_posterior + difference)
+    ahead = [r.log_posterior - first_now.log_posterior for r in hidden]
+    # Room in the sum of posteriors is made for all of them together.
+    ranked = rescored_against(ranked, first, first.log_posterior + float(np.logaddexp.reduce(ahead)))
     posterior = next(r.posterior for r in ranked if r.name == first.name)
     raised = dict[str, Ranked]()
-    for r in hidden:
+    for r, nats in zip(hidden, ahead, strict=True):
         gain = r.score.log_bayes_factor - first_now.score.log_bayes_factor
         raised[r.name] = replace(
             r,
             score=replace(r.score, log_bayes_factor=first.score.log_bayes_factor + gain),
-            log_posterior=first.log_posterior + differences[r.name],
-            posterior=posterior * float(np.exp(differences[r.name])),
+            log_posterior=first.log_posterior + nats,
+            posterior=posterior * float(np.exp(nats)),
         )
     return tuple(sorted((raised.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
 

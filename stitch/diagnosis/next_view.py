@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.diagnosis.deciding_view import DecidingViews, deciding_views, possible_joints
+from stitch.diagnosis.deciding_view import deciding_views, possible_joints
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
 from stitch.diagnosis.naming import does_an_unmodelled_effect_explain_it
 from stitch.diagnosis.ranking import Ranked, is_contender
@@ -76,7 +76,7 @@ def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
         undecided = len(to_separate) if diagnosis.verdict == "cannot_tell" else 0
         views = deciding_views(diagnosis.linear, rivals, undecided=undecided)
         if views is not None:
-            return (*_poses(diagnosis.linear, names, views), *artefacts)
+            return (*_poses(diagnosis.linear, names, *views), *artefacts)
         unknown = least_known_view(diagnosis) if diagnosis.verdict == "unknown_effect" else None
         return artefacts if unknown is None else (unknown, *artefacts)
 
@@ -121,18 +121,21 @@ def _others_near(diagnosis: Diagnosis, to_separate: list[Ranked]) -> list[Ranked
     return [ranked for ranked in others if not moves_points([ranked.score.form.term])][:_OTHERS]
 
 
-def _poses(linear: LinearModel, names: tuple[str, ...], views: DecidingViews) -> tuple[Proposal, ...]:
+def _poses(
+    linear: LinearModel, names: tuple[str, ...], joints: Array, waits: Array, probabilities: Array
+) -> tuple[Proposal, ...]:
     """Return a proposal for each view that decides, in the order in which they are to be taken.
 
     Args:
         names: effects that the views separate.
+        joints, waits, probabilities: (K, n), (K,), (K,), of `deciding_views`.
     """
     proposals = []
-    for k, (joints, wait, probability) in enumerate(zip(views.joints, views.wait, views.probability, strict=True)):
+    for k, (wait, probability) in enumerate(zip(waits.tolist(), probabilities.tolist(), strict=True)):
         what = "take a view near" if k == 0 else "then another near"
         later = f", {wait / 60:.0f} min after the last view" if wait else ""
-        do = f"{what} {angles_text(joints)}{later}"
-        proposals.append(replace(_pose(linear, do, names, joints), wait_s=float(wait), probability=float(probability)))
+        pose = _pose(linear, f"{what} {angles_text(joints[k])}{later}", names, joints[k])
+        proposals.append(replace(pose, wait_s=wait, probability=probability))
     return tuple(proposals)
 
 

@@ -76,18 +76,6 @@ class Score:
         return bool(np.isfinite(self.covariance).all())
 
 
-@dataclass(frozen=True)
-class FormTrial:
-    """How well one form explains the views, fitted with all variances."""
-
-    log_bayes_factor: float
-    p_value: float
-    values: Array  # (p,) fitted freely
-    covariance: Array  # (p, p)
-    variances: Array  # (c,) fitted beside it
-    scale: float  # likeliest multiple of the plausible sizes
-
-
 def score(linear: LinearModel, candidate: Candidate, start: Array | None = None) -> Score:
     """Return how well a candidate explains the views, by its best form, with all other pose errors as random effects.
 
@@ -106,11 +94,11 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     # Where the scatter has absorbed a gross effect, no plausible size seems observable; yet the effect gains.
     observable = any(seen for _, seen in at_starts) or bool(gains.max() > limits.LOG_BAYES_FACTOR)
     weights = form_weights(candidate)
-    trials = dict[int, FormTrial]()
+    trials = dict[int, Score]()
     for i in _forms_to_fit(base, candidate, gains, regime_of(linear).forms_refitted):
         _, scale = at_starts[best_start[i]][0][i]
         variances = starts[best_start[i]].null.variances if start is None else start
-        trials[i] = try_form(base, candidate.forms[i], variances, scale)
+        trials[i] = try_form(base, candidate, candidate.forms[i], variances, scale)
     # A form without a fit keeps its gain at fixed variances, a lower bound, and a p-value of 1.
     log_shares = np.array([trials[i].log_bayes_factor if i in trials else gains[i] for i in range(len(gains))])
     log_shares = log_shares + np.log(weights)
@@ -124,21 +112,13 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
         return Score(candidate, observable, form, p_value, log_bayes_factor, nothing, unknown, log_shares=log_shares)
     if not observable:
         p_value, log_bayes_factor = 1.0, 0.0
-    k = max(trials, key=lambda i: trials[i].log_bayes_factor)
-    best = trials[k]
-    return Score(
-        candidate,
-        observable,
-        candidate.forms[k],
-        p_value,
-        log_bayes_factor,
-        best.values,
-        best.covariance,
-        best.scale,
-        best.variances,
-        base_model=replace(base, null=at_variances(base.mixed, best.variances)) if regime_of(base).prior else None,
-        log_shares=log_shares,
+    best = max(trials.values(), key=lambda trial: trial.log_bayes_factor)
+    best = replace(
+        best, observable=observable, p_value=p_value, log_bayes_factor=log_bayes_factor, log_shares=log_shares
     )
+    if not regime_of(base).prior:
+        return best
+    return replace(best, base_model=replace(base, null=at_variances(base.mixed, best.variances)))
 
 
 def _forms_to_fit(base: LinearModel, candidate: Candidate, gains: Array, most: int) -> list[int]:
@@ -157,8 +137,8 @@ def _forms_to_fit(base: LinearModel, candidate: Candidate, gains: Array, most: i
     return [i for i in sorted(visible[: 1 if is_hopeless else most]) if gains[i] >= least]
 
 
-def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> FormTrial:
-    """Return the fit of one form with all variances estimated again: log Bayes factor, p-value, values.
+def try_form(linear: LinearModel, candidate: Candidate, form: Form, start: Array, scale: float) -> Score:
+    """Return how well one form of a candidate explains the views, fitted with all variances estimated again.
 
     Two fits are made. With the prior of plausible sizes, at several scales, the likelihood gives the Bayes factor. With
     a wide prior of `FREE_SIZES` plausible sizes, as good as none, come the values θ and the Wald test θᵀ C⁻¹ θ.
@@ -191,7 +171,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     theta, covariance = free.mean[a:], free.covariance[a:, a:]
     p_value = _wald_p_value(linear, form, theta, covariance)
     log_bayes_factor = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(deviances.values())), scales)
-    return FormTrial(log_bayes_factor, p_value, theta, covariance, integrated.variances, scale)
+    return Score(candidate, True, form, p_value, log_bayes_factor, theta, covariance, scale, integrated.variances)
 
 
 def _wald_p_value(linear: LinearModel, form: Form, theta: Array, covariance: Array) -> float:

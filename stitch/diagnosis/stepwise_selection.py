@@ -143,24 +143,21 @@ def _stable_selection(
     It ends when nothing is left to remove or exchange.
 
     Args:
+        candidates: effects that may be added; one that was removed is added no more, but as a replacement.
         chosen: effects to begin with.
     """
-    remaining = list(candidates)
+    addable = list(candidates)
     exchanged = set[str]()
-    # Effects removed at ends that change as little with as without them.
-    untested = set[str]()
-    refused = dict[str, str]()
+    # By name of an effect that was removed: why, and whether the ends change as little with it as without.
+    removed = dict[str, tuple[str, bool]]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
-        chosen, end_tests = _eliminate_backward(linear, chosen, len(remaining))
-        worst = _worst_at_ends(linear, remaining, chosen, end_tests)
+        chosen, end_tests = _eliminate_backward(linear, chosen, len(addable))
+        worst = _worst_at_ends(linear, addable, chosen, end_tests)
         replacements = list[Ranked]()
         if worst is not None:
             name, at_ends = worst
-            refused[name] = at_ends.rejection_reason(name)
-            untested -= {name}
-            if at_ends.unseen:
-                untested.add(name)
+            removed[name] = at_ends.rejection_reason(name), at_ends.unseen
         else:
             rivals = [c for c in candidates if c.name not in exchanged]
             exchange = find_exchange(linear, rivals, chosen, end_tests)
@@ -168,15 +165,16 @@ def _stable_selection(
                 break
             name, reason, replacement = exchange
             replacements.append(replacement)
-            refused.pop(replacement.name, None)  # it erred beside the one that gives way
-            refused[name] = reason
+            removed.pop(replacement.name, None)  # it erred beside the one that gives way
+            removed[name] = reason, False
             exchanged.add(name)
-            untested -= {name, replacement.name}
-        remaining = [c for c in remaining if c.name != name]
+        addable = [c for c in addable if c.name != name]
         kept = [r for r in chosen if r.name != name]
-        chosen = _add_effects(linear, remaining, [*kept, *replacements])
+        chosen = _add_effects(linear, addable, [*kept, *replacements])
+    refused = {name: reason for name, (reason, _) in removed.items()}
+    untested = sorted(name for name, (_, unseen) in removed.items() if unseen)
     if len(untested) > 1:
-        refused |= dict.fromkeys(untested, untested_ends_reason(sorted(untested)))
+        refused |= dict.fromkeys(untested, untested_ends_reason(untested))
     likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
     return ForwardSelection(likeliest_first, explained, refused)
 
@@ -255,15 +253,19 @@ def _eliminate_backward(
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
     """Return the chosen effects that are certain with all others in the model, and their test at ends of joint ranges.
 
-    Effects are judged in order; one that fails is removed before the next is judged. All are first scored in parallel
-    beside all the others. These results hold as long as no effect fails or changes its form; then they are redone.
+    The rule is sequential: each effect is judged beside those that stay of the ones before it, and all after it. As
+    mostly all stay as they are, all are judged at once, beside all the others. Those results count up to the first
+    effect that fails, or stays in another form; from there on each is judged anew.
+
+    Args:
+        tests: number of effects among which each was chosen.
 
     Returns:
         Effects kept; and by name the test, None where the views are too few for one.
     """
     start = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
 
-    def beside_others(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
+    def judged(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
         """Return an effect scored with the others of `among` in the model, and, if it is certain, its test at ends."""
         without_r = conditioned_without(linear, among, r, start)
         again = rank_one(without_r, r.score.candidate, tests, start)
@@ -271,21 +273,21 @@ def _eliminate_backward(
 
     kept = list(chosen)
     end_tests = dict[str, Extrapolation | None]()
-    parallel_results_hold = True
-    for r, result in zip(chosen, list(parallel(beside_others, chosen)), strict=True):
-        again, at_ends = result if parallel_results_hold else beside_others(r, kept)
-        others = [other for other in kept if other.name != r.name]
-        if not (is_certain(again) and again.score.form is r.score.form):
-            # The others were scored beside this one as it was.
-            parallel_results_hold = False
+    all_stayed = True
+    for r, judged_at_once in zip(chosen, list(parallel(judged, chosen)), strict=True):
+        again, at_ends = judged_at_once if all_stayed else judged(r, kept)
+        kept = [other for other in kept if other.name != r.name]
+        if not is_certain(again) or again.score.form is not r.score.form:
+            # What was tested so far was tested beside this one as it was.
+            all_stayed = False
             end_tests = {}
-        kept = [*others, again] if is_certain(again) else others
         if is_certain(again):
+            kept.append(again)
             end_tests[again.name] = at_ends
     for r in kept:
         if r.name not in end_tests:
             end_tests[r.name] = extrapolate(conditioned_without(linear, kept, r, start), r.score)
-    return kept, {r.name: end_tests[r.name] for r in kept}
+    return kept, end_tests
 
 
 def find_exchange(

@@ -197,21 +197,27 @@ class Dictionary:
     observation: Observation
 
     def credited(self, effect: Ranked, laws: Sequence[Ranked]) -> Ranked:
-        """Return an effect with the log posterior of the law that it says, if that explains more than the effect.
+        """Return an effect with the log posterior of a law that it says, where that explains more than the effect.
 
         The law may act along one axis where the effect has six. It counts only in a shape that the effect can have: a
         wave twice a turn is none once a turn. A law of one of J joints is charged log 2J: an effect does not say
         beforehand which joint errs, or whether all do.
+
+        Args:
+            effect: scored in the model in which the laws are.
+            laws: ranked laws of this dictionary.
         """
-        spans = _full_spans(effect.score.candidate)
-        joints = sum(place is not None for place in {law.place.joint for law in self.laws})
-        of_laws = [
-            r.score.log_bayes_factor - (float(np.log(2 * joints)) if law_of(r).place.joint else 0.0)
-            for r in laws
-            if effect.name in self.said_by[law_of(r).key]
-            and any(span.contains(Span(r.score.form.columns)) for span in spans)
-        ]
-        gain = max([0.0, *(factor - effect.score.log_bayes_factor for factor in of_laws)])
+        effect_spans = _full_spans(effect.score.candidate)
+        joints = {law.place.joint for law in self.laws if law.place.joint is not None}
+        gain = 0.0
+        for ranked in laws:
+            law, score = law_of(ranked), ranked.score
+            if effect.name not in self.said_by[law.key]:
+                continue
+            law_span = Span(score.form.columns)
+            if any(span.contains(law_span) for span in effect_spans):
+                charge = 0.0 if law.place.joint is None else float(np.log(2 * len(joints)))
+                gain = max(gain, score.log_bayes_factor - charge - effect.score.log_bayes_factor)
         return replace(effect, log_posterior=effect.log_posterior + gain)
 
     @cached_property
@@ -492,28 +498,30 @@ def _says(
     driver: Driver,
     law_spans: Callable[[], Sequence[Span]],
 ) -> bool:
-    """Return whether an effect implies a law: same place and driver, as the effect declares or as its columns show.
+    """Return whether an effect says a law: that its place follows this driver is what the effect is.
 
-    An effect of a body whose declared needs name the driver says the law. Otherwise columns decide: those of the effect
-    must be in the span of a body's law, or those of a law of a joint or link in the span of the effect.
+    Of a body it says so where it declares the driver among its needs, or where it can do nothing that the law cannot:
+    its columns lie in the span of the law's. Of a joint or link it says so where it can do all that the law can: what
+    it declares may be meant of any joint. A step is said by events alone.
 
     Args:
         effect_spans: of the effect with all its parameters.
         law_spans: function that returns the spans of the law; called only where columns decide.
     """
     effect = candidate.effect
+    is_body = place.kind in BODIES
     # An external axis moves a body as a whole: the part, or the base of what it carries.
-    if effect.place != place.kind and not (effect.place == "axis" and place.kind in BODIES):
+    if effect.place != place.kind and not (effect.place == "axis" and is_body):
         return False
-    follows = {*effect.needs, *effect.prefers}
+    is_event = any(p.discrete for p in candidate.parameters)
+    declared = {*effect.needs, *effect.prefers}
     if effect.prefers and not any(views.has(name) for name in effect.prefers):
-        follows.add(TIME)
-    event = any(p.discrete for p in candidate.parameters)
-    declared = driver.name in follows or (driver.name == STEP and event)
-    if place.kind in BODIES and declared:
+        declared.add(TIME)  # which stands in for the columns that it prefers
+    if is_event:
+        declared.add(STEP)
+    if is_body and driver.name in declared:
         return True
-    if (driver.name == STEP) != event:
+    if (driver.name == STEP) != is_event:
         return False
-    if place.kind in BODIES:
-        return any(law.contains(span) for law in law_spans() for span in effect_spans)
-    return any(span.contains(law) for law in law_spans() for span in effect_spans)
+    pairs = ((law, span) for law in law_spans() for span in effect_spans)
+    return any(law.contains(span) if is_body else span.contains(law) for law, span in pairs)

@@ -138,17 +138,14 @@ class JointEffect:
         return replace(base, mixed=mixed, pose_errors=errors, null=null, full_model=None)
 
 
-def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tuple[JointEffect, ...]:
+def joint_effects(base: LinearModel) -> tuple[JointEffect, ...]:
     """Return one unmodelled effect for each joint and each kind, likeliest first.
 
     An unmodelled effect is a smooth random function of what it follows, such as the joint's angle. Where a joint has
     several functions of a kind, as for each other joint, the likeliest stands for all, with their mean Bayes factor.
     Sizes are fitted, for which `log_posterior_of_any` charges. () without joints, or where pose errors have no prior.
-
-    Args:
-        kinds: what the effects follow, as OWN_ANGLE; None: all kinds.
     """
-    effects = sorted(_effects_at_null_variances(base, kinds), key=lambda effect: -effect.log_bayes_factor)
+    effects = sorted(_effects_at_null_variances(base), key=lambda effect: -effect.log_bayes_factor)
     # All variances are fitted again for the likeliest few. The others keep a lower bound: their gain without that.
     for k, effect in enumerate(effects[: limits.JOINT_EFFECTS_FITTED]):
         null = effect.model.null
@@ -166,14 +163,12 @@ def joint_effects(base: LinearModel, kinds: Sequence[str] | None = None) -> tupl
     return tuple(sorted(likeliest, key=lambda effect: -effect.log_bayes_factor))
 
 
-def _effects_at_null_variances(base: LinearModel, kinds: Sequence[str] | None) -> Iterator[JointEffect]:
-    """Yield all unmodelled effects of these kinds, with the log Bayes factors of their likeliest sizes.
+def _effects_at_null_variances(base: LinearModel) -> Iterator[JointEffect]:
+    """Yield all unmodelled effects of single joints, with the log Bayes factors of their likeliest sizes.
 
     The variances of all other errors stay those of the null fit.
     """
     for follows, errors in _joint_processes(base).items():
-        if kinds is not None and follows not in kinds:
-            continue
         for process, joint in enumerate(errors.joints):
             kernel = errors.kernel_of(process)
             shapes = kernel @ leading_trends(kernel, len(kernel))

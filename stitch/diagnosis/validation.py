@@ -303,25 +303,21 @@ class _HalfEvidence:
 def objection_in_halves(scored: Score) -> str | None:
     """Return the reason, as text, to reject a candidate by halves of the views; None where there is none.
 
-    Its best form is fitted in either half. It has to help in the other half, on average over several ways to halve,
-    and both halves have to show the same size. None also where pose errors have no prior, and for labelled points.
+    It has to help in one half as the other half finds it, on average over several ways to halve, and both halves have
+    to find the same size of its best form. None also where pose errors have no prior, and for labelled points.
     """
     base = scored.base_model
     if base is None or base.observation.numbers_per_view is not None:
         return None
-    sizes = scored.form.sizes
     gains, p_values, shares = [], [], []
     ways = halves_of(base.observation.capture.T_base_flange, base.observation.reach)
-    for way in ways:
-        explained = [base.explained_without(other) for other in reversed(way)]
-        gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (explained, explained[::-1])))
-        first, second = (_half_evidence(base, U, scored.form) for U in explained)
-        p_values.append(_size_consistency(first, second, sizes))
-        # The smaller share that a half finds of what both find together, along its direction.
-        information = first.information + second.information
-        both = _HalfEvidence(information, first.vector + second.vector).fitted(sizes)[0]
-        along = information @ both / max(float(both @ information @ both), 1e-300)
-        shares.append(min(float(along @ half.fitted(sizes)[0]) for half in (first, second)))
+    for first_views, second_views in ways:
+        # What either half shows is what the views of the other do not explain.
+        first, second = base.explained_without(second_views), base.explained_without(first_views)
+        gains.append(_predictive_factor(scored, base, first, second) + _predictive_factor(scored, base, second, first))
+        halves = [_half_evidence(base, explained, scored.form) for explained in (first, second)]
+        p_values.append(_size_consistency(*halves, scored.form.sizes))
+        shares.append(_smaller_share(*halves, scored.form.sizes))
     if np.mean(gains) <= 0:
         return f"{scored.name}, found in one half of the views, does not help in the other"
     # Bonferroni over the ways to halve. A clear effect whose form is not quite right differs a little, beyond chance:
@@ -333,20 +329,35 @@ def objection_in_halves(scored: Score) -> str | None:
 
 
 def _half_evidence(base: LinearModel, explained: Array, form: Form) -> _HalfEvidence:
+    """Return what a half of the views says of a form.
+
+    Args:
+        explained: (n, k) orthonormal, what is not this half's in the whitened observations.
+    """
     white = base.whiten(form.columns)
     white = white - explained @ (explained.T @ white)
     return _HalfEvidence(white.T @ white, white.T @ base.white_z)
 
 
 def _predictive_factor(scored: Score, base: LinearModel, chosen_in: Array, tested_in: Array) -> float:
-    """Return the log Bayes factor in one half of the form that the other half prefers, at the sizes found there; before
-    any view these are of the scale that all views together prefer."""
+    """Return the log Bayes factor in one half of the form that the other half prefers, at the sizes found there.
+
+    Before any view these sizes are of the scale that all views together prefer. Both halves as in `_half_evidence`.
+    """
     forms = scored.candidate.forms
     evidence = [_half_evidence(base, chosen_in, form) for form in forms]
     priors = [scored.scale * form.sizes for form in forms]
     best = max(range(len(forms)), key=lambda i: evidence[i].log_evidence(np.diag(priors[i] ** -2)))
     mean, precision = evidence[best].fitted(priors[best])
     return _half_evidence(base, tested_in, forms[best]).log_evidence(precision, mean)
+
+
+def _smaller_share(first: _HalfEvidence, second: _HalfEvidence, sizes: Array) -> float:
+    """Return the smaller share that a half finds of what both find together: bᵀ I θ / bᵀ I b of both's values b."""
+    information = first.information + second.information
+    both = _HalfEvidence(information, first.vector + second.vector).fitted(sizes)[0]
+    along = information @ both / max(float(both @ information @ both), 1e-300)
+    return min(float(along @ half.fitted(sizes)[0]) for half in (first, second))
 
 
 def _size_consistency(first: _HalfEvidence, second: _HalfEvidence, sizes: Array) -> float:

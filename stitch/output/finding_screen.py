@@ -22,7 +22,7 @@ from stitch.diagnosis.effect_trend import (
 )
 from stitch.diagnosis.fitted_effect import EffectTrend
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
-from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words, why_without_a_name
+from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
@@ -31,7 +31,7 @@ from stitch.numerics.least_squares import project_out
 from stitch.numerics.units import angle_text, display_unit, length_text
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches
 from stitch.output.comparison.model_history import model_history
-from stitch.output.plain_finding import errs_by_view, open_doubts
+from stitch.output.plain_finding import open_doubts, unnamed_finding
 from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, effect_description, plain_covariate
 from stitch.system.threads import remembered
 
@@ -182,9 +182,9 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
         rarer = candidate.ranked.log_belief < named.ranked.log_belief
         return "yes, though met more rarely (a judgement)" if rarer else "yes"
     against = named.ranked.score.log_bayes_factor - candidate.ranked.score.log_bayes_factor
-    objection = next((note for note in diagnosis.notes if note.startswith(f"{candidate.name}: ")), "")
+    objection = next((note for note in diagnosis.notes if note.startswith(f"{candidate.name} explains")), "")
     if objection and against < ODDS:
-        return f"no: {objection.removeprefix(f'{candidate.name}: ')}"
+        return f"no: it{objection.removeprefix(candidate.name)}"
     return f"no: the evidence is {odds_text(max(against, 0.0))} against it"
 
 
@@ -200,17 +200,18 @@ def _deciding_view(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> dict
     view = expected_in_view(diagnosis.linear, rivals, np.radians(pose.joints_deg), pose.wait_s)
     if view is None:
         return None
-    expected = [{"effect": name, "value": value, "sigma": sigma} for name, (value, sigma) in view.expected.items()]
+    at, scatter, heights = view
+    expected = [{"effect": name, "value": value, "sigma": sigma} for name, (value, sigma) in heights.items()]
     trend = trends[rivals[0].name]
     return {
         "joints_deg": pose.joints_deg,
         "wait_s": pose.wait_s,
         "views": sum(proposal.joints_deg is not None for proposal in diagnosis.next),
         "probability": pose.probability,
-        "at": view.at,
+        "at": at,
         "of": trend.of,
         "value_unit": trend.value_unit,
-        "sigma": view.sigma,
+        "sigma": scatter,
         "expected": expected,
     }
 
@@ -267,18 +268,7 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
                 return _tested(diagnosis, "missing")
             return f"In the model: {'; '.join(in_model)}. {_tested(diagnosis, 'further')}"
         case "unknown_effect":
-            follows = ""
-            if errs_by_view(diagnosis):
-                follows = ": each scan errs by itself"
-            elif diagnosis.follows_field:
-                follows = ": the scanner errs over its field of view"
-            elif diagnosis.laws:
-                follows = f": {' or '.join(unnamed_in_words(diagnosis))}"
-            elif diagnosis.curves:
-                follows = f": the error follows joint {diagnosis.curves[0].joint}"
-            elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
-                follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
-            return f"Something is missing, and {why_without_a_name(diagnosis)}{follows}."
+            return unnamed_finding(diagnosis)
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
     if diagnosis.verdict == "cannot_tell":
         return _rivals(named, trends, unnamed_in_words(diagnosis))
@@ -352,29 +342,31 @@ def error_sources(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def unseen_text(diagnosis: Diagnosis) -> str:
-    """Return a sentence with the smallest detectable sizes of effects, and how far these move the views (rms).
+    """Return a sentence on what could hide in these views: the smallest size of an effect that would show in them.
 
-    It lists the three that move the views most, beyond what a change of the hand-eye could do too. Empty unless nothing
-    is missing, and where no size is known.
+    Of each effect it is that of the parameter which shows best. Told are the three effects that would move the views
+    most (rms of the reduced observations), hand-eye fitted anew. Empty unless nothing is missing and a size is known.
     """
     if diagnosis.verdict != "adequate":
         return ""
-    linear, unit = diagnosis.linear, diagnosis.linear.measurement.length_unit
+    linear = diagnosis.linear
+    length_unit = linear.measurement.length_unit
     hand_eye = linear.reduce(linear.design[:, :6])
-    sizes = list[tuple[float, str]]()  # by how much it moves the views, and its text
+    hidden = list[tuple[float, str]]()  # by how much an effect moves the views, and its text
     for candidate in diagnosis.candidates:
-        name, form = clearest_parameter(candidate), candidate.ranked.score.candidate.forms[0]
-        k = next((k for k, p in enumerate(form.term.parameters) if p.name == name), 0)
-        size = candidate.detectable.get(name or "", np.inf)
-        if not np.isfinite(size):
+        name = clearest_parameter(candidate)
+        smallest = candidate.detectable.get(name or "", np.inf)
+        if not np.isfinite(smallest):
             continue
-        # Displacement of the views per unit of the parameter, without the part that the hand-eye can imitate.
-        column = project_out(hand_eye, form.reduced[:, k : k + 1])
-        moved = size * float(np.linalg.norm(column)) / np.sqrt(max(linear.mixed.size, 1))
-        factor, shown = display_unit(form.term.parameters[k].unit)
-        amount = f"{name} = {factor * size:.2g} {shown}".rstrip()
-        sizes.append((moved, f"{candidate.name} below {amount} (moves views by {length_text(moved, unit, 2)})"))
-    largest = [text for _, text in sorted(sizes, reverse=True)[:_BEST]]
+        form = candidate.ranked.score.candidate.forms[0]
+        k = next(k for k, p in enumerate(form.term.parameters) if p.name == name)
+        # What the parameter does to the views per unit, without what the hand-eye does as well.
+        per_unit = project_out(hand_eye, form.reduced[:, k : k + 1])
+        moved = smallest * float(np.linalg.norm(per_unit)) / np.sqrt(max(linear.mixed.size, 1))
+        factor, shown_unit = display_unit(form.term.parameters[k].unit)
+        amount = f"{name} = {factor * smallest:.2g} {shown_unit}".rstrip()
+        hidden.append((moved, f"{candidate.name} below {amount} (moves views by {length_text(moved, length_unit, 2)})"))
+    largest = [text for _, text in sorted(hidden, reverse=True)[:_BEST]]
     return f"Too small to show here: {'; '.join(largest)}." if largest else ""
 
 
@@ -547,8 +539,6 @@ def certainty(diagnosis: Diagnosis) -> str:
             if repeating := reportable(diagnosis.repeating_errors, diagnosis.implausible):
                 odds = odds_text(max(error.log_bayes_factor for error in repeating))
                 return f"The odds that these errors repeat, and are no scatter, are {odds}."
-            why = why_without_a_name(diagnosis)
-            return f"{why[0].upper()}{why[1:]}{f': {diagnosis.notes[0]}' if diagnosis.notes else ''}."
     likeliest = next((c.ranked for c in diagnosis.candidates if c.ranked.score.observable), None)
     if likeliest is None:
         return "No known effect can be tested with these views."

@@ -69,9 +69,7 @@ def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
             something = "Something is" if diagnosis.certain else "Something may be"
             return f"{something} missing in the model: {named}. These views cannot tell which.{odds}"
         case "unknown_effect":
-            return (
-                f"Something is missing in the model, and {why_without_a_name(diagnosis)}{_error_location(diagnosis)}."
-            )
+            return unnamed_finding(diagnosis)
     validation = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0]).cross_validation
     though = "" if diagnosis.likelier_than_not else ", though chance is more likely"
     missing = "Missing in the model" if diagnosis.certain else f"Perhaps missing in the model{though}"
@@ -83,6 +81,11 @@ def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
     if validation is None:
         return f"{missing}: {named}.{odds}"
     return f"{missing}: {named}.{odds} {_expected_gain(diagnosis.residual_rms, validation, length_unit)}"
+
+
+def unnamed_finding(diagnosis: Diagnosis) -> str:
+    """Return a sentence on an error without a name: why it has none, and what it follows or where it is."""
+    return f"Something is missing in the model, and {why_without_a_name(diagnosis)}{_error_location(diagnosis)}."
 
 
 def _expected_gain(residual_rms: float, validation: CrossValidation, length_unit: str) -> str:

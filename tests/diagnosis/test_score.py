@@ -42,7 +42,7 @@ def linear():
 def test_the_gain_is_that_of_all_scales_together_wherever_the_search_begins(linear, scale):
     candidate = candidate_of(linear, EFFECTS["mount_drift"])
     form = candidate.forms[0]
-    found = try_form(linear, form, linear.null.variances, scale)
+    found = try_form(linear, candidate, form, linear.null.variances, scale)
     free = null_space(linear.mixed.A[0].T).T
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
     fixed, columns = free @ linear.mixed.fixed[0] @ free.T, free @ form.columns

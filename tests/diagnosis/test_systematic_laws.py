@@ -11,8 +11,8 @@ from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of, candidates_of
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
 from stitch.diagnosis.effect_trend import trend_of_law
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.law_ranking import law_size, rank_laws
-from stitch.diagnosis.naming import propose_names
 from stitch.diagnosis.ranking import stands_out
 from stitch.diagnosis.score import scatter_limit, score
 from stitch.diagnosis.sentences import law_in_words
@@ -154,6 +154,6 @@ def test_no_effect_loses_as_it_grows(cell, own_effect, name):
     for amplitude in (1, 3, 10, 30, 100):
         seen = shown(linear, amplitude * column)
         evidence.append(score(seen, candidate).log_bayes_factor)
-        found = propose_names(seen, candidates, limit)
+        found = gather_evidence(seen, candidates, limit)
         assert evidence[-1] < 3 or name in [r.name for r in found.named], (amplitude, found.verdict, found.laws[:2])
     assert (np.diff(evidence) > 0).all(), evidence

@@ -113,6 +113,12 @@ def test_two_joints_that_drag_each_other_are_told_by_the_two_angles(cell):
     assert {c.covariate for c in curves} <= {"j3_deg", "j5_deg"} and curves[0].covariate == "j5_deg"
 
 
+def of_kind(linear, kind):
+    """Return a model in which single joints may err by functions of one kind alone."""
+    errors = linear.pose_errors
+    return replace(linear, pose_errors=replace(errors, joint_processes={kind: errors.joint_processes[kind]}))
+
+
 def test_the_effect_of_two_angles_is_the_mean_over_a_joints_partners(cell):
     """By hand from each partner's own law; and a function of two angles falls off as the product of both."""
     q = cell.measured.plan.joints
@@ -124,9 +130,9 @@ def test_the_effect_of_two_angles_is_the_mean_over_a_joints_partners(cell):
     for p in smooth.of_joint(3):
         own = replace(smooth, joints=(3,), columns=smooth.columns[:, [p]], kernel=smooth.kernel[[p]])
         errors = replace(linear.pose_errors, joint_processes={TWO_ANGLES: own})
-        (effect,) = joint_effects(replace(linear, pose_errors=errors), [TWO_ANGLES])
+        (effect,) = joint_effects(replace(linear, pose_errors=errors))
         factors.append(np.exp(effect.log_bayes_factor))
-    whole = next(effect for effect in joint_effects(linear, [TWO_ANGLES]) if effect.joint == 4)
+    whole = next(effect for effect in joint_effects(of_kind(linear, TWO_ANGLES)) if effect.joint == 4)
     assert len(factors) == 5 and np.exp(whole.log_bayes_factor) == pytest.approx(np.mean(factors))
     apart = 2 * np.sin(0.5 * np.abs(q[0] - q[5]))
     process = smooth.of_joint(3)[0]
@@ -314,7 +320,7 @@ def test_effects_of_a_joint_in_time_and_under_load_stand_against_every_name(cell
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
     linear = cell.seen(kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
     base = linear.restricted(linear.causes - {"joint_offset"})
-    found = {kind: joint_effects(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
+    found = {kind: joint_effects(of_kind(base, kind)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
     best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
     assert best[WITH_TIME] > max(own for kind, own in best.items() if kind != WITH_TIME)
 

@@ -200,7 +200,7 @@ def _found(
             "Not very sure: the odds that it is more than chance are 3 to 1",
         ),
         (_found("unknown_effect", 2e-4), "one of 5,000 sessions (p = 0.0002)."),
-        (_found("unknown_effect", 0.5), "No known effect explains it."),
+        (_found("unknown_effect", 0.4), "play comes nearest. Chance alone would show as much in 40% of such sessions"),
         (_found("adequate", 0.4), "play comes nearest. Chance alone would show as much in 40% of such sessions"),
     ],
 )

@@ -122,7 +122,7 @@ from stitch.numerics import frames
 from stitch.diagnosis import candidates
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.naming import propose_names
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
 from stitch.session.capture import prepare_capture
@@ -152,7 +152,7 @@ assert np.isfinite(off).all() and np.abs(off).max() < 4, off
 plate = np.array([[60., 10, 30], [-40, 55, 30], [-20, -60, 30], [10, 5, 30], [-70, -10, 30], [50, -50, 30]])
 cell, T_mount, _ = labelled_cell(1, views=30, offset=np.array([0, 0, 1.5e-3, 0, 0, 0]), targets=plate)
 linear = plate_model(measurement_of(cell, prepare_capture(cell)), Model(T_mount))
-selection = propose_names(linear, candidates_of(linear)[0], ScatterLimit(*IMPLAUSIBLE))
+selection = gather_evidence(linear, candidates_of(linear)[0], ScatterLimit(*IMPLAUSIBLE))
 assert selection.verdict == "missing_effect", selection.verdict
 (best,) = selection.named
 found = {p.name: (v, s) for p, v, s in zip(best.score.form.free, best.score.values, best.score.sigmas)}
