@@ -37,8 +37,7 @@ from stitch.errors import NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.planning.drive import DrivenCell, drive
 from stitch.plugins.metrology.planning.expected_model import cell_of_state, simulate_views
-from stitch.plugins.metrology.planning.plan import KnownPlace, PossibleViews, place_lever
-from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
+from stitch.plugins.metrology.planning.plan import KnownPlace, PossibleViews, candidate_joints, place_lever, with_views
 
 # A law, its amplitude, the joint (from 0) that it is in, how many views there are, and the scene; of a law in a joint
 # those views in which the joint turns least, of 36. Of an arm's other laws nature draws the joint.

@@ -135,7 +135,7 @@ def fit(
 
     wanted = Wanted(output, recording, report, session, as_json)
     if follow:
-        from stitch.plugins.cells.follow import run_follow
+        from stitch.plugins.cells.window import run_follow
 
         run_follow(file, allowance, wanted)
         return

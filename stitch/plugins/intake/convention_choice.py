@@ -2,6 +2,10 @@
 
 Three judges, from cheap to dear: the centroids of the clouds come to one point, the motions between neighbouring scans
 close, the surfaces of all views fall together. The engine is that of `stitch check --deep`.
+
+Scans cannot tell "the scanner at the flange" from "the part at the flange, poses inverted": both move alike. What
+tells them apart is where things lie: what sits at the flange is near its origin, what stands in the cell is not near
+that of the base.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -13,8 +17,9 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing
+from stitch.plugins.intake.guesses import Because, Guess
 from stitch.plugins.intake.layouts import MM, POSE_UNITS
-from stitch.plugins.intake.readings import Reading
+from stitch.plugins.intake.readings import JOINT_ANGLES, Reading
 from stitch.plugins.intake.refusals import Refusal, change, state
 from stitch.screening.background import find_standing_scene
 from stitch.screening.closing import CLEARLY_BETTER, fit_centroids, surface_misfit
@@ -24,6 +29,10 @@ from stitch.screening.motions import FEWEST, TRANSLATION_M, RelativeScans, alike
 from stitch.session.capture import Capture
 from stitch.session.session import Mount
 from stitch.system.process import steps
+
+# Scanner or part sits at the flange if it lies this much nearer to its frame's origin than the other.
+_NEARER = 1.5
+_WORDS = {"eye_in_hand": "the scanner sits at the flange", "eye_to_hand": "the part sits at the flange"}
 
 
 @dataclass(frozen=True)
@@ -362,3 +371,43 @@ def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decid
             "frame already, or most of what they show stands still before the scanner",
             change(folder, "export every scan in the scanner's own frame, or cut away what stands still"),
         )
+
+
+def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool | None) -> tuple[str, bool, Guess]:
+    """Return the mount, whether the table holds T_flange_base, and why: as stated, else by where things lie.
+
+    Args:
+        mount, inverse: as stated; None where they are not.
+    """
+    reading = decided.best.interpretation.reading
+    of_joints = reading.rotation == JOINT_ANGLES
+    direct = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
+    other = "eye_to_hand" if decided.best.interpretation.carries else "eye_in_hand"
+    away = (decided.scanner_away, decided.part_away)
+    scanner, part = (f"{mm:.0f} mm" for mm in away)
+    placed = (
+        f"under it the scanner lies {scanner} from the origin of its frame and the part {part} from that of its own"
+    )
+    told = True
+    by: Because = "file"
+    if mount is not None:
+        chosen, reason = mount, "stated with --mount"
+    elif reading.layout.turntable:
+        chosen, reason = "eye_to_hand", "a turntable carries the part"
+    elif inverse is not None or of_joints:
+        chosen = other if inverse else direct
+        reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")
+    elif decided.determined and max(away) > _NEARER * min(away):
+        chosen = "eye_in_hand" if min(away) == decided.scanner_away else "eye_to_hand"
+        reason = f"{placed}: what lies nearer sits at the flange"
+        by = "usual"
+    elif decided.determined:
+        chosen, reason, told = direct, f"{placed}; poses are usually those of the flange in the base", False
+    else:
+        chosen, reason, told = direct, "as poses usually are", False
+    inverted = chosen != direct
+    value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
+    rest = other if chosen == direct else direct
+    runner_up = f"{rest} with poses {'inverted' if not inverted else 'as they are'}" if mount is None else None
+    guess = Guess("mount", value, reason, told, "--mount", runner_up, by, None, {"mount": chosen}, {"mount": rest})
+    return chosen, inverted, guess

@@ -22,6 +22,7 @@ from stitch.plugins.intake.convention_choice import (
     all_interpretations,
     choose_by_surfaces,
     choose_convention,
+    choose_mounting,
     fitted_scale,
     require_no_background,
     require_own_frames,
@@ -39,7 +40,6 @@ from stitch.plugins.intake.layouts import (
     kept_column,
     unit_pairs,
 )
-from stitch.plugins.intake.mounting import Mounting, choose_mounting
 from stitch.plugins.intake.raw_poses import RawPoses, header_poses
 from stitch.plugins.intake.readings import (
     Reading,
@@ -57,8 +57,7 @@ from stitch.plugins.intake.scan_targets import find_folder_targets, target_motio
 from stitch.plugins.intake.session_guesses import session_guesses
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.plugins.intake.stops import rows_with_scans
-from stitch.plugins.intake.sudden_change import require_no_change
-from stitch.plugins.intake.two_parts import groups_apart, require_one_part
+from stitch.plugins.intake.sudden_change import groups_apart, require_no_change, require_one_part
 from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
@@ -82,7 +81,8 @@ class FirstSession:
     raw: RawPoses
     cloud_unit: str
     choice: ConventionChoice
-    mounting: Mounting
+    mount: str
+    inverted: bool  # the poses as read are T_flange_base
     guesses: tuple[Guess, ...]
     optical_axis: str
     sightings: tuple[Sighting, ...] = ()  # mm, of every cloud, where targets are looked for
@@ -158,13 +158,13 @@ def _session_of(found: FolderFiles, stated: StatedFolder) -> FirstSession:
         return replace(again, guesses=tuple(_unit_of_pairs(guess, alike, stated) for guess in again.guesses))
     require_scale(found, scale, stated)
     axis, axis_guess = guess_optical_axis(clouds)
-    settled = choose_mounting(decided, stated.mount, stated.inverse)
+    mount, inverted, mount_guess = choose_mounting(decided, stated.mount, stated.inverse)
     told = session_guesses(found, raw, decided, points, own_units, stated)
     told = tuple(_unit_of_pairs(guess, alike, stated) for guess in told) if len(alike) > 1 else told
-    guesses = (*told, settled.guess, axis_guess, *of_targets)
+    guesses = (*told, mount_guess, axis_guess, *of_targets)
     aside = _not_used(found, raw, decided, [*lost, *_coded(clouds)])
     return FirstSession(
-        found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box, not_used=aside
+        found, raw, own_units[0], decided, mount, inverted, guesses, axis, seen, box=stated.box, not_used=aside
     )
 
 
@@ -325,11 +325,11 @@ def _profiles_of_a_sphere(
     decided = ConventionChoice(ConventionScore(way, np.eye(4), np.inf, False, None), None, False, (), 0.0, 0.0)
     points = [cloud.points for cloud in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
-    mounting = choose_mounting(decided, stated.mount, stated.inverse)
+    mount, inverted, mount_guess = choose_mounting(decided, stated.mount, stated.inverse)
     axis, axis_guess = guess_optical_axis(clouds)
     sphere = Guess("sphere", f"radius {radii[0]:g} mm", "stated with --ball", True, "--ball")
-    guesses = (*session_guesses(files, raw, decided, points, own_units, stated), mounting.guess, axis_guess, sphere)
-    return FirstSession(files, raw, own_units[0], decided, mounting, guesses, axis, sphere_mm=radii[0])
+    guesses = (*session_guesses(files, raw, decided, points, own_units, stated), mount_guess, axis_guess, sphere)
+    return FirstSession(files, raw, own_units[0], decided, mount, inverted, guesses, axis, sphere_mm=radii[0])
 
 
 def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:

@@ -102,7 +102,7 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     unit = length_unit(first)
     lines += ["", *comment_lines(told["length_unit"]), f'length_unit = "{unit}"']
     lines += ["", *comment_lines(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
-    lines += ["", *comment_lines(told["mount"]), f'mount = "{first.mounting.mount}"']
+    lines += ["", *comment_lines(told["mount"]), f'mount = "{first.mount}"']
     lines += ["", "[scanner]", *comment_lines(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
     if len(first.box):
         corners = (first.box * CLOUD_UNITS[first.cloud_unit] / METRES[unit]).tolist()
@@ -214,7 +214,8 @@ def _flange_poses(first: FirstSession, rows: list[int]) -> Array:
         T = T.copy()
         T[:, along, 3] -= sign * np.asarray(way.reading.layout.rest[column])[rows]
     scale = _scale_of_poses(first)
-    return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
+    T = frames.make(T[:, :3, :3], T[:, :3, 3] * scale)
+    return frames.inverse(T) if first.inverted else T
 
 
 def joint_columns(reading: Reading, rows: Sequence[int]) -> dict[str, list[str]]:

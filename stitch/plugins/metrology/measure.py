@@ -46,7 +46,7 @@ def measure(
     from stitch.output.json_file import to_json, write_json
     from stitch.output.run_folder import call_entry_points, lock_run_folder
     from stitch.output.stored_run import load_run
-    from stitch.plugins.metrology.documents import measure_csv, measure_document
+    from stitch.plugins.metrology.budget import measure_csv, measure_document
     from stitch.plugins.metrology.error_sources import place_errors
     from stitch.plugins.metrology.place_errors import point_sigmas, write_sigmas
     from stitch.plugins.metrology.verb import measure as measure_run
@@ -86,7 +86,7 @@ def _require_measure_options(features: Path | None, trials: int, dfq: Path | Non
 
 
 def _write_dfq(measured: MeasuredFeatures, part: str, run: Path, file: Path) -> None:
-    from stitch.plugins.metrology.documents import characteristics
+    from stitch.plugins.metrology.budget import characteristics
     from stitch.plugins.watch.dfq_file import dfq_text
     from stitch.system.files import whole_file
 

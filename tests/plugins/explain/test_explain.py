@@ -21,8 +21,7 @@ from stitch.effects.contract import EFFECTS, missing_need
 from stitch.effects.user_file import load
 from stitch.numerics import frames
 from stitch.plugins.explain.dictionary import Ingredient, build_dictionary, coefficient
-from stitch.plugins.explain.explain import explain
-from stitch.plugins.explain.formula_file import effect_source, formula_text
+from stitch.plugins.explain.explain import effect_source, explain, formula_text
 from stitch.plugins.explain.quantities import Quantity, backlash_lag, nonlinear_torque, saw_of_joint, view_quantities
 from stitch.plugins.explain.search import search_sums
 from stitch.session.measurement import views_of

@@ -224,7 +224,7 @@ def test_angles_in_names_turn_the_part_about_z(tmp_path, campaign):
     first = first_session(tmp_path, StatedFolder())
     T = first.choice.best.interpretation.reading.T
     assert np.degrees(np.arctan2(T[:, 1, 0], T[:, 0, 0])) == pytest.approx([0, 15, 35])
-    assert first.mounting.mount == "eye_to_hand"
+    assert first.mount == "eye_to_hand"
 
 
 def test_profiles_of_a_sphere_become_a_session_for_its_calibration(tmp_path, campaign):

@@ -98,7 +98,7 @@ def plan_views(
     from stitch.output.json_file import to_json
     from stitch.output.session_files import whole_folder, write_table
     from stitch.plugins.metrology.planning.plan import plan_further_views
-    from stitch.plugins.metrology.planning.plan_document import plan_document, view_columns
+    from stitch.plugins.metrology.planning.verb import plan_document, view_columns
 
     _require_plan_options(views, size, field, output)
     if drive is not None or until_U is not None:

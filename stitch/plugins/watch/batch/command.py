@@ -59,7 +59,7 @@ def batch(
       stitch batch blade-* --scheduler tcp://10.0.0.5:8786
       stitch batch blade-* --store small --session-seconds 600 --session-memory 4GB
     """
-    from stitch.plugins.watch.batch.storage import is_remote, put_summary
+    from stitch.plugins.watch.batch.run_batch import is_remote, put_summary
 
     if scheduler and workers > 1:
         raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")

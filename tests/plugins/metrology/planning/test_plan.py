@@ -31,8 +31,8 @@ from stitch.plugins.metrology.planning.plan import (
     place_lever,
     plan_further_views,
     travel_order,
+    with_views,
 )
-from stitch.plugins.metrology.planning.planned_views import with_views
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_folder import load_session
