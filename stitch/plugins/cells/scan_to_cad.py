@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import feature_matching, frames
 from stitch.numerics.distributions import TUKEY, mad_sigma, tukey
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.plugins.cells.cad import (
     CadSurface,
     Regions,
@@ -284,14 +284,7 @@ def fit_cad(
     by_cell = False
     numbers = np.zeros(prior.columns)
     for _ in range(_ROUNDS):
-        T = frames.inverse(T_base_part)
-        local = frames.transform(T, scan.points)
-        distance, normal, used = nearest_partners(cad, local, frames.rotate(T, scan.normals))
-        used = used if regions is None else used & regions.used(local)
-        if used.sum() < _MIN_FIT_POINTS:
-            raise NoResultError(
-                f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
-            )
+        local, distance, normal, used = _meeting_points(scan, cad, T_base_part, regions)
         stock = allowance_columns(local, cad, prior)
         design = np.hstack([frames.plane_rows(local - cad.centre, normal), -stock])
         rest = distance - prior.known - stock @ numbers
@@ -327,6 +320,25 @@ def fit_cad(
         points=len(rest),
         allowance=allowance,
     )
+
+
+def _meeting_points(
+    scan: JoinedScans, cad: CadSurface, T_base_part: Array, regions: Regions | None
+) -> tuple[Array, Array, Array, Mask]:
+    """Return points (N, 3) in the part's frame, distances (N,) from the CAD, its normals (N, 3), and which count (N,).
+
+    Raises:
+        NoResultError: too few do.
+    """
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, scan.points)
+    distance, normal, used = nearest_partners(cad, local, frames.rotate(T, scan.normals))
+    used = used if regions is None else used & regions.used(local)
+    if used.sum() < _MIN_FIT_POINTS:
+        raise NoResultError(
+            f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
+        )
+    return local, distance, normal, used
 
 
 def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:

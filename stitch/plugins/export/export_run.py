@@ -106,13 +106,7 @@ def export_run(
     from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run, ros_launch
     from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_of_run
 
-    if (to is None) == (program is None):
-        raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
-    require_new(output)
-    if program is None and to not in _FORMATS:
-        raise InputError(f"--to {to}: no such format{did_you_mean(str(to), _FORMATS)}; to fix: one of {_KINDS}")
-    if datum and to not in CLOUD:
-        raise InputError(f"--datum: is of a cloud; to fix: name one of --to {', '.join(CLOUD)}")
+    _require_export_options(to, program, output, datum)
     if program is not None and (run / "fit.json").is_file():
         _export_moved_program(program, run / "fit.json", output, frame, part=part, as_json=as_json)
     elif program is not None:
@@ -136,6 +130,16 @@ def export_run(
         _export_cloud(run, str(to), output, datum)
         if as_json:
             _emit_files(str(to), output)
+
+
+def _require_export_options(to: str | None, program: Path | None, output: Path | None, datum: bool) -> None:
+    if (to is None) == (program is None):
+        raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
+    require_new(output)
+    if program is None and to not in _FORMATS:
+        raise InputError(f"--to {to}: no such format{did_you_mean(str(to), _FORMATS)}; to fix: one of {_KINDS}")
+    if datum and to not in CLOUD:
+        raise InputError(f"--datum: is of a cloud; to fix: name one of --to {', '.join(CLOUD)}")
 
 
 def _prove(run: Path, on: list[Path] | None, effects_file: Path | None, trust: bool) -> None:

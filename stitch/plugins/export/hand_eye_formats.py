@@ -157,48 +157,20 @@ def hand_eye_from(
     Raises:
         InputError: a name that a frame cannot have, or numbers that the views do not show and nobody states.
     """
-    unknown = result.get("hand_eye_unknown", [])
     session = str(result.get("name") or Path(result["session"]).name)
-    if result.get("reference_frame") not in (None, "base", "flange"):
-        raise InputError(
-            f"{session}: without a robot there is no hand-eye; to fix: take the axes from result.json, their place in "
-            "the scanner's frame"
-        )
-    if unknown and not result.get("hand_eye_stated"):
-        raise InputError(
-            f"{session}: these views do not show {', '.join(unknown)} of the hand-eye; to fix: add views turned about "
-            "other axes, or state [scanner] pose in session.toml"
-        )
+    _require_hand_eye(result, session)
     metres = METRES[model.length_unit]
     scale = np.repeat([1.0, metres], 3)
     alone = None if with_effects else result.get("hand_eye_alone")
     T = np.array(alone["hand_eye"]) if alone else model.T_mount.copy()
     covariance = np.array(alone["covariance"]) if alone else model.covariance
     T[:3, 3] *= metres
-    notes = [uncertainty_scope(diagnosis.get("verdict")).rstrip(".")]
-    candidates = diagnosis.get("candidates", [])
-    missed = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
-    if missed:
-        # U is that of the model.
-        size, name = max(missed)
-        pushed = length_text(size, model.length_unit, 2)
-        notes.append(
-            f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"
-        )
-    notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
-    notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
-    of_effects = ""
-    effects = [name for name in model.effects if name != PLACEMENT]
-    if alone:
-        off, spread = (length_text(alone[key], model.length_unit, 2) for key in ("displacement", "spread"))
-        of_effects = (
-            f"At the mean of {', '.join(effects)} over these views: without these effects the model's hand-eye "
-            f"is off by {off} at the part. Single views differ by {spread} (rms), which U holds"
-        )
-    elif effects:
-        of_effects = f"Not in these numbers, as they are one rigid motion: {', '.join(effects)}"
+    of_effects = _effects_note(alone, [name for name in model.effects if name != PLACEMENT], model.length_unit)
     axes = result.get("axes", ())
-    notes += [_axis_note(axis, model.length_unit) for axis in axes]
+    notes = [
+        *_uncertainty_notes(result, diagnosis, model.length_unit),
+        *(_axis_note(axis, model.length_unit) for axis in axes),
+    ]
     return ExportedHandEye(
         session=session,
         T_mount=T,
@@ -209,8 +181,60 @@ def hand_eye_from(
         child=_require_plain_name("--child", child or "scanner"),
         notes=(*notes, of_effects) if of_effects else tuple(notes),
         of_effects=of_effects,
-        axes=tuple((axis["name"], _axis_frame(axis, METRES[model.length_unit])) for axis in axes),
+        axes=tuple((axis["name"], _axis_frame(axis, metres)) for axis in axes),
     )
+
+
+def _require_hand_eye(result: dict[str, Any], session: str) -> None:
+    """Refuse a result without a hand-eye, or one of which numbers are neither shown nor stated.
+
+    Raises:
+        InputError: says which, and what to do.
+    """
+    unknown = result.get("hand_eye_unknown", [])
+    if result.get("reference_frame") not in (None, "base", "flange"):
+        raise InputError(
+            f"{session}: without a robot there is no hand-eye; to fix: take the axes from result.json, their place in "
+            "the scanner's frame"
+        )
+    if unknown and not result.get("hand_eye_stated"):
+        raise InputError(
+            f"{session}: these views do not show {', '.join(unknown)} of the hand-eye; to fix: add views turned about "
+            "other axes, or state [scanner] pose in session.toml"
+        )
+
+
+def _uncertainty_notes(result: dict[str, Any], diagnosis: dict[str, Any], length_unit: str) -> list[str]:
+    """Return sentences on what U holds, what it does not, and numbers that were not measured."""
+    notes = [uncertainty_scope(diagnosis.get("verdict")).rstrip(".")]
+    candidates = diagnosis.get("candidates", [])
+    missed = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
+    if missed:
+        # U is that of the model.
+        size, name = max(missed)
+        pushed = length_text(size, length_unit, 2)
+        notes.append(
+            f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"
+        )
+    notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
+    if unknown := result.get("hand_eye_unknown"):
+        notes.append(f"As stated in session.toml, not measured: {', '.join(unknown)}")
+    return notes
+
+
+def _effects_note(alone: dict[str, Any] | None, effects: Sequence[str], length_unit: str) -> str:
+    """Return what of the effects the numbers hold; "" without effects.
+
+    Args:
+        alone: the hand-eye at the mean of the effects over the views, as result.json has it; None: another is exported.
+    """
+    if alone:
+        off, spread = (length_text(alone[key], length_unit, 2) for key in ("displacement", "spread"))
+        return (
+            f"At the mean of {', '.join(effects)} over these views: without these effects the model's hand-eye "
+            f"is off by {off} at the part. Single views differ by {spread} (rms), which U holds"
+        )
+    return f"Not in these numbers, as they are one rigid motion: {', '.join(effects)}" if effects else ""
 
 
 def _axis_note(axis: dict[str, Any], length_unit: str) -> str:

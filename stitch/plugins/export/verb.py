@@ -58,18 +58,7 @@ def export_run(
     if datum is not None and to not in CLOUD_FORMATS:
         raise InputError(f"datum: is of a cloud; to fix: name one of {', '.join(CLOUD_FORMATS)}")
     if to in CLOUD_FORMATS:
-        if path is None or path.suffix.lower() != f".{to}":
-            raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
-        if not len(run.fused.points):
-            raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
-        write, _ = CLOUD_FORMATS[to]
-        cloud = coloured(stored_cloud(run), run.session.length_unit)
-        if datum is not None:
-            if datum.T_datum_reference is None:
-                raise InputError("datum: these were measured without one; to fix: state datum in FEATURES.toml")
-            cloud = in_datum(cloud, datum.T_datum_reference)
-        with whole_file(path) as out:
-            write(cloud, out)
+        _write_cloud(run, to, path, datum)
         return None
     if to in ARM_FORMATS:
         session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
@@ -88,3 +77,18 @@ def export_run(
         with whole_file(path) as out:
             out.write_text(text, encoding="utf-8")
     return text
+
+
+def _write_cloud(run: RunData, to: str, path: Path | None, datum: MeasuredFeatures | None) -> None:
+    if path is None or path.suffix.lower() != f".{to}":
+        raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
+    if not len(run.fused.points):
+        raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
+    write, _ = CLOUD_FORMATS[to]
+    cloud = coloured(stored_cloud(run), run.session.length_unit)
+    if datum is not None:
+        if datum.T_datum_reference is None:
+            raise InputError("datum: these were measured without one; to fix: state datum in FEATURES.toml")
+        cloud = in_datum(cloud, datum.T_datum_reference)
+    with whole_file(path) as out:
+        write(cloud, out)

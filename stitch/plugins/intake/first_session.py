@@ -3,7 +3,7 @@
 What a person states is taken; what the files tell is read; the rest is decided by the scans (`choose_convention`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -232,29 +232,59 @@ def _decide(
         in_own = choose(ways_to_read, [own])
         decided = in_own if in_own.determined else decided
     require_own_frames(found.folder, motions, decided)
-    closes = decided.determined and (decided.best.closed is None or decided.best.closed >= MOST_CLOSED)
-    apart = groups_apart(capture, decided.best) if decided.determined else None
-    if (apart or not closes) and len(pairs[0].used) == len(found.clouds):
-        ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
-        require_no_change(every.clouds, (capture, kept, motions()), ways, decided.best)
-    if apart:
-        require_one_part(every.clouds, apart, decided.best, kept)
+    # Where names do not pair all clouds, another pairing may be the change.
+    complete = len(pairs[0].used) == len(kept)
+    ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False)) if complete else []
+    _require_one_campaign(every.clouds, capture, kept, motions, ways, decided)
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
     if not decided.determined:
         doubted += [*mixed_readings(raw, stated), *left_handed_readings(raw, stated)]
         unit = decided.best.interpretation.length_unit
         ways = all_interpretations([*ways_to_read, *doubted], pairs, [unit], (True, False))
-        depth = found.clouds[0].suffix.lower() in DEPTH_SUFFIXES
-        # Where counts are far too large or small the motions close less well.
-        scale = fitted_scale(motions(), ways, (1.0, 10.0, 0.1) if depth else (1.0,))
-        if scale is not None and abs(np.log(scale)) >= _SCALE and (depth or _is_between_units(scale)):
+        scale = _scale_beyond_units(found, motions(), ways)
+        if scale is not None:
             return decided, scale
     if doubted and not decided.determined:
         decided = weigh_doubts(decided, choose(doubted))
     elif doubted and not (layout.sure or stated.rotation):
         decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
     return decided, None
+
+
+def _scale_beyond_units(found: FolderFiles, motions: RelativeScans, ways: Sequence[Interpretation]) -> float | None:
+    """Return how many times the robot's motions the scans are, where no unit says so; None where one does."""
+    depth = found.clouds[0].suffix.lower() in DEPTH_SUFFIXES
+    # Where counts are far too large or small the motions close less well.
+    scale = fitted_scale(motions, ways, (1.0, 10.0, 0.1) if depth else (1.0,))
+    if scale is None or abs(np.log(scale)) < _SCALE:
+        return None
+    return scale if depth or _is_between_units(scale) else None
+
+
+def _require_one_campaign(
+    clouds: Sequence[Path],
+    capture: Capture,
+    kept: Sequence[int],
+    motions: Callable[[], RelativeScans],
+    ways: Sequence[Interpretation],
+    decided: ConventionChoice,
+) -> None:
+    """Refuse scans between which something changed: tool, part or base at one view, two lists of poses, two parts.
+
+    Args:
+        clouds: of the folder, of which `kept` show something.
+        ways: to read the poses, should something have changed; none: that is not asked.
+
+    Raises:
+        InputError: names the views.
+    """
+    closes = decided.determined and (decided.best.closed is None or decided.best.closed >= MOST_CLOSED)
+    apart = groups_apart(capture, decided.best) if decided.determined else None
+    if ways and (apart or not closes):
+        require_no_change(clouds, (capture, kept, motions()), ways, decided.best)
+    if apart:
+        require_one_part(clouds, apart, decided.best, kept)
 
 
 def _uncoupled(decided: ConventionChoice, urdf: Path | None) -> ConventionChoice:

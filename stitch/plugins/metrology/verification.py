@@ -47,6 +47,9 @@ _ANSWERS_TO = {
 # By kind of feature the name of the error of its first number.
 _ERRORS = {"sphere": "size", "cylinder": "size", "circle": "size", "distance": "distance"}
 _LENGTHS = ("size", "distance")
+# Keys of the certificate that are called as the fields that they hold.
+_OF_HAND_EYE = ("distance", "turn", "ratio", "U", "U_given", "p_value")
+_OF_NUMBERS = ("error", "calibrated", "U_calibrated", "deviation", "E_n", "E_n_limit", "limit", "passes")
 
 
 @dataclass(frozen=True)
@@ -269,6 +272,7 @@ def verification_document(
         state: the artefact's session stitched under the model: its doubts, notes and views left out stand there too.
     """
     hand_eye = result.hand_eye
+    doubts, notes_of_run, left_out = ((), (), ()) if state is None else (state.doubts, state.notes, state.left_out)
     return {
         "format": VERIFY_FORMAT,
         "run": run,
@@ -280,39 +284,24 @@ def verification_document(
         "answers_to": list(result.answers_to),
         "U_holds": result.U_holds,
         "agreeing": result.agreeing,
-        "hand_eye": {
-            "agrees": hand_eye.holds,
-            "distance": hand_eye.distance,
-            "turn": hand_eye.turn,
-            "ratio": hand_eye.ratio,
-            "U": hand_eye.U,
-            "U_given": hand_eye.U_given,
-            "p_value": hand_eye.p_value,
-        },
+        "hand_eye": {"agrees": hand_eye.holds} | {key: getattr(hand_eye, key) for key in _OF_HAND_EYE},
         "numbers": [
             {
                 "feature": n.number.feature.name,
-                "error": n.error,
                 "measured": n.number.value,
                 "U": n.number.U,
-                "calibrated": n.calibrated,
-                "U_calibrated": n.U_calibrated,
-                "deviation": n.deviation,
-                "E_n": n.E_n,
-                "E_n_limit": n.E_n_limit,
-                "limit": n.limit,
-                "passes": n.passes,
                 "answers_to": list(n.answers_to),
             }
+            | {key: getattr(n, key) for key in _OF_NUMBERS}
             for n in result.numbers
         ],
         "forms": [
             {"feature": f.feature, "form_95": f.form, "limit": f.limit, "passes": f.passes} for f in result.forms
         ],
         "not_measured": result.not_measured,
-        "doubts": [] if state is None else list(state.doubts),
-        "notes": [*(() if state is None else state.notes), *notes],
-        "left_out": [{"view": item.view, "why": item.why} for item in (() if state is None else state.left_out)],
+        "doubts": list(doubts),
+        "notes": [*notes_of_run, *notes],
+        "left_out": [{"view": item.view, "why": item.why} for item in left_out],
         "valid_until": valid_until,
         "conditional_on": list(error_sources.NOT_INCLUDED),
         "in_the_manner_of": ["VDI/VDE 2634 part 3", "ISO 10360-13"],

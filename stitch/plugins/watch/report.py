@@ -14,7 +14,7 @@ from stitch.numerics.units import MICROMETRES, covariate_unit, display_unit, len
 from stitch.plugins.watch.history import History
 from stitch.plugins.watch.onset import find_onset
 from stitch.plugins.watch.state_bank import COVARIATES, SLOPE, Bank, predicted_bank
-from stitch.plugins.watch.tracking import Alarm, smoothed_states
+from stitch.plugins.watch.tracking import Alarm, Sessions, smoothed_states
 from stitch.plugins.watch.update import (
     DAY_SECONDS,
     last_state,
@@ -167,25 +167,16 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
     last_run, last = history.sql("SELECT id, time FROM runs ORDER BY time DESC, id DESC LIMIT 1")[0]
     calibration = history.stated("in_use")
     used, in_use, used_time = history.sql("SELECT id, name, time FROM runs WHERE run_hash = ?", calibration)[0]
-    ends = sessions_from(history, [used, last_run])
-    at_used = ends.ids.index(used)
-    conditions = ends.covariates[ends.ids.index(last_run)]
-    limits = _parameter_limits(history, ends.sigmas[at_used], tolerance)
-    best = state.bank.chosen(state.bank.best)
-    sloped = _likeliest_sloped(state.bank)
-    days = days_valid(best, ends.covariates[at_used], ends.values[at_used], limits)
-    # As the last session states them that shows a parameter, else the first.
-    stated = np.where(np.isfinite(ends.sigmas[-1]), ends.sigmas[-1], best.unit)
-    common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * stated
     named = {run for change in events for run in (change.since, change.raised)}
     rows = [history.sql("SELECT id, name, time FROM runs WHERE id = ?", run)[0] for run in named]
     times = {run: float(time) for run, _, time in rows}
-    x = np.concatenate([[1.0, 0.0], conditions])
+    sloped = _likeliest_sloped(state.bank)
+    ends = sessions_from(history, [used, last_run])
+    at = [ends.ids.index(run) for run in (used, last_run)]
+    numbers, days = _parameter_numbers(history, state.bank, ends, at, tolerance)
+    best = state.bank.chosen(state.bank.best)
     parameters = []
     for p, (name, unit) in enumerate(stored_parameters(history)):
-        scale = best.unit[p]
-        scatter = best.scatter[p, 0]
-        own_sigma = scale * np.sqrt(max(x @ best.covariance[p, 0] @ x, 0.0) * scatter)
         slope, slope_sigma, slope_p_value = _significance(sloped, p, SLOPE)
         changes = tuple(c for c in events if c.parameter == p)
         # An alarm stands until a calibration after it is in use, a drift as long as it goes on.
@@ -195,18 +186,11 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
             ParameterReport(
                 name=name,
                 unit=unit,
-                value=float(best.origin[p] + scale * (best.mean[p, 0] @ x)),
-                sigma=float(np.hypot(own_sigma, common[p])),
-                common_sigma=float(common[p]),
-                scatter=float(np.sqrt(scatter)),
-                drift_per_day=float(scale * slope),
-                drift_sigma=float(scale * slope_sigma),
-                process_noise=float(scale * np.sqrt(best.noise[p, 0, 0] * scatter)),
+                **{key: float(of_all[p]) for key, of_all in numbers.items()},
+                drift_per_day=float(best.unit[p] * slope),
+                drift_sigma=float(best.unit[p] * slope_sigma),
                 follows=_followed_channels(p, ends.channels, best),
-                in_use=float(ends.values[at_used, p]),
-                limit=float(limits[p]),
                 valid_until=float(last + DAY_SECONDS * days[p]) if np.isfinite(days[p]) else None,
-                own_sigma=float(own_sigma),
                 changes=changes,
                 alarm=max(standing, key=lambda c: times[c.raised], default=None),
             )
@@ -223,6 +207,39 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
         run_times=times,
         run_length=float(history.stated("run_length")),
     )
+
+
+def _parameter_numbers(
+    history: History, bank: Bank, ends: Sessions, at: Sequence[int], tolerance: float | None
+) -> tuple[dict[str, Array], Array]:
+    """Return numbers (P,) of all parameters by the fields of `ParameterReport`, and days (P,) that they stay valid.
+
+    Args:
+        bank: after the last session.
+        ends: holds the session whose calibration is in use, and the last one.
+        at: where these two stand in it.
+        tolerance: as of `cell_report`.
+    """
+    used, last = at
+    best = bank.chosen(bank.best)
+    scatter = best.scatter[:, 0]
+    x = np.concatenate([[1.0, 0.0], ends.covariates[last]])
+    # As the last session states them that shows a parameter, else the first.
+    stated = np.where(np.isfinite(ends.sigmas[-1]), ends.sigmas[-1], best.unit)
+    common = np.sqrt(np.maximum(1 - scatter, 0.0)) * stated
+    own_sigma = best.unit * np.sqrt(np.maximum(x @ best.covariance[:, 0] @ x, 0.0) * scatter)
+    limits = _parameter_limits(history, ends.sigmas[used], tolerance)
+    numbers = {
+        "value": best.origin + best.unit * (best.mean[:, 0] @ x),
+        "sigma": np.hypot(own_sigma, common),
+        "common_sigma": common,
+        "scatter": np.sqrt(scatter),
+        "process_noise": best.unit * np.sqrt(best.noise[:, 0, 0] * scatter),
+        "in_use": ends.values[used],
+        "limit": limits,
+        "own_sigma": own_sigma,
+    }
+    return numbers, days_valid(best, ends.covariates[used], ends.values[used], limits)
 
 
 def _parameter_limits(history: History, sigmas: Array, tolerance: float | None) -> Array:
