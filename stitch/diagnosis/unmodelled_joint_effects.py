@@ -39,7 +39,6 @@ from stitch.numerics.kernels import (
     SmoothErrors,
     direction_reach,
     exponential_kernel,
-    joint_kernel_factors,
     periodic_kernel,
     rbf_joints,
     short_range_kernel,
@@ -82,6 +81,12 @@ _FOLLOWED = {
 }
 _DEGREES = float(np.degrees(1.0))
 _CURVE_POINTS = 25  # over the range of the covariate
+# Covariances below this are none: such a factor of a product cannot be divided out of it.
+_NO_COVARIANCE = 1e-290
+
+# One number that an effect follows: its name, its values (V,) in the views, the unit in which it is reported per unit
+# of these, and the factor of the effect's covariance by it: function from values (S,) and (O,) to (S, O).
+_Covariate = tuple[str, Array, float, Callable[[Array, Array], Array]]
 
 
 @dataclass(frozen=True)
@@ -286,58 +291,35 @@ def joint_curves(effects: Sequence[JointEffect]) -> tuple[JointCurve, ...]:
     return tuple(sorted((c for c in curves if c.share > limits.CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
 
-@dataclass(frozen=True)
-class _Covariate:
-    """One number that an effect follows, with the two factors of the effect's covariance: by it, and by all else."""
-
-    name: str
-    view_values: Array  # (V,)
-    kernel: Callable[[Array, Array], Array]  # factor (S, O) between values (S,) and (O,) of the number
-    remaining_kernel: Array | float = 1.0  # (V, V) factor between views, by all else that the effect follows
-    unit: float = 1.0  # the number as it is reported, per unit of `view_values`
-
-
 def _covariates(effect: JointEffect) -> list[_Covariate]:
-    """Return all numbers that an effect follows, each with the factors of the effect's covariance.
-
-    The covariance is a product with one factor for each number: the remaining kernel is the product of the others.
-    """
+    """Return all numbers that an effect follows; its covariance is the product of a factor for each."""
     k = effect.joint - 1
     views = effect.base.measurement.views
-    q = views.joints
+    angles = views.joints.T
+    degrees = [(f"j{j + 1}_deg", angle, _DEGREES) for j, angle in enumerate(angles)]
     if effect.follows == ALL_ANGLES:
-        factors = joint_kernel_factors(q, q)
-        others = [np.prod(np.delete(factors, j, axis=2), axis=2) for j in range(q.shape[1])]
-        return [_along_angle(j, q, _smooth_in_angle, others[j]) for j in range(q.shape[1])]
+        return [(*of_joint, _smooth_in_angle) for of_joint in degrees]
     if effect.follows == TWO_ANGLES:
-        partner = effect.errors.others[effect.process]
-        pairs = ((k, partner), (partner, k))
-        return [_along_angle(a, q, _one_of_two_angles, _one_of_two_angles(q[:, b], q[:, b])) for a, b in pairs]
+        return [(*degrees[j], _one_of_two_angles) for j in (k, effect.errors.others[effect.process])]
     if effect.follows == OWN_ANGLE:
-        return [_along_angle(k, q, short_range_kernel)]
+        return [(*degrees[k], short_range_kernel)]
     if effect.follows == WAVES:
-        return [_along_angle(k, q, partial(periodic_kernel, period=effect.errors.periods[effect.process]))]
+        return [(*degrees[k], partial(periodic_kernel, period=effect.errors.periods[effect.process]))]
     if effect.follows == TRAVEL:
-        angle = q[:, k]
-        move = angle - views.previous[:, k]
-        along_move = partial(exponential_kernel, reach=direction_reach(angle))
-        return [
-            _along_angle(k, q, _smooth_in_angle, along_move(move, move)),
-            _Covariate(f"j{effect.joint}_move_deg", move, along_move, _smooth_in_angle(angle, angle), _DEGREES),
-        ]
+        move = angles[k] - views.previous[:, k]
+        along_move = partial(exponential_kernel, reach=direction_reach(angles[k]))
+        return [(*degrees[k], _smooth_in_angle), (f"j{effect.joint}_move_deg", move, _DEGREES, along_move)]
     if effect.follows == JOINT_LOAD:
-        return _along_torques(effect)
+        return _bending_torques(effect)
     seconds = usual_time_step(effect.base.measurement)
     name, unit = ("time_s", seconds) if seconds else ("view", 1.0)
     along_time = partial(exponential_kernel, reach=DRIFT_MEMORY["slowly wandering"])
-    rest = (1 + rbf_joints(q)) / 2 if effect.follows == WITH_TIME else 1.0
-    return [_Covariate(name, time_in_steps(effect.base.measurement), along_time, rest, unit)]
+    return [(name, time_in_steps(effect.base.measurement), unit, along_time)]
 
 
-def _along_torques(effect: JointEffect) -> list[_Covariate]:
-    """Return the torques that bend the joint of an effect, as its covariates; not those that never change."""
+def _bending_torques(effect: JointEffect) -> list[_Covariate]:
+    """Return the torques that bend the joint of an effect; not those that never change."""
     torques = effect.base.measurement.views.torques
-    kernel = effect.errors.kernel_of(effect.process)
     bending = [t for t, k in enumerate(torques.joint) if k == effect.joint - 1 and np.ptp(torques.values[:, t]) > STILL]
     covariates = []
     for t in bending:
@@ -345,20 +327,8 @@ def _along_torques(effect: JointEffect) -> list[_Covariate]:
         along_torque = partial(exponential_kernel, reach=len(bending) * float(np.ptp(torque)))
         # The name of a torque between two joints, as 2_3, means 1 kg at a link whose mass nobody states.
         name = f"j{torques.names[t]}_torque_nm" + ("_per_kg" if "_" in torques.names[t] else "")
-        covariates.append(_Covariate(name, torque, along_torque, kernel / along_torque(torque, torque)))
+        covariates.append((name, torque, 1.0, along_torque))
     return covariates
-
-
-def _along_angle(
-    joint: int, joints: Array, kernel: Callable[[Array, Array], Array], remaining_kernel: Array | float = 1.0
-) -> _Covariate:
-    """Return the angle of a joint, counted from 0, as a covariate reported in degrees.
-
-    Args:
-        joints: (V, n) angles of all joints in the views, rad.
-        kernel, remaining_kernel: as in `_Covariate`.
-    """
-    return _Covariate(f"j{joint + 1}_deg", joints[:, joint], kernel, remaining_kernel, _DEGREES)
 
 
 def _smooth_in_angle(some: Array, others: Array) -> Array:
@@ -377,25 +347,28 @@ def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) ->
     Args:
         variance: of the effect over the views, rad²; the curve's share is of this.
     """
-    of_views = covariate.view_values
+    name, of_views, unit, kernel = covariate
     views = len(of_views)
     grid = np.linspace(of_views.min(), of_views.max(), _CURVE_POINTS)
     places = np.append(grid, of_views)
+    # The factor by all else that the effect follows; 1 where nothing is left of that by the covariate.
+    alone = kernel(of_views, of_views)
+    remaining = np.ones((views, views))
+    np.divide(effect.errors.kernel_of(effect.process), alone, out=remaining, where=alone > _NO_COVARIANCE)
     # Averaged over what else the effect follows: with each view's values of that, and with all pairs of views.
-    remaining = np.broadcast_to(covariate.remaining_kernel, (views, views))
-    with_views = remaining.mean(axis=0) * covariate.kernel(places, of_views)
-    with_places = remaining.mean() * covariate.kernel(places, places)
+    with_views = remaining.mean(axis=0) * kernel(places, of_views)
+    with_places = remaining.mean() * kernel(places, places)
     # Takes off the mean over the views, the last of the places.
     centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_CURVE_POINTS, views])
     mean, covariance = _posterior_error(effect, centred @ with_views, centred @ with_places @ centred.T)
     return JointCurve(
         joint=effect.joint,
-        covariate=covariate.name,
+        covariate=name,
         share=min(float(mean[_CURVE_POINTS:].var() / max(variance, 1e-300)), 1.0),
-        at=covariate.unit * grid,
+        at=unit * grid,
         error=mean[:_CURVE_POINTS],
         sigma=np.sqrt(np.maximum(np.diag(covariance)[:_CURVE_POINTS], 0)),
-        view_values=covariate.unit * of_views,
+        view_values=unit * of_views,
         may_follow=effect.may_follow,
         place=effect.place,
     )
