@@ -584,10 +584,9 @@ def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) ->
     # One row for each view and turn: T_reference_mount.
     turned = np.array([[T @ T_mount for T in about_part] for T_mount in capture.T_reference_mount])
     poses = turned.reshape(-1, 4, 4)
-    to_centre = frames.make(np.eye(3), -gram.centre)
     # Both (·, 6, 6): left twist of a view about the centre per right twist of the hand-eye.
-    jacobians_taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
-    jacobians_proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
+    jacobians_taken = frames.adjoint_about(gram.centre, capture.hand_eye_frames(live_fit.T_mount))
+    jacobians_proposed = frames.adjoint_about(gram.centre, poses @ live_fit.T_mount)
     relative_U = partial(_relative_uncertainty, lever=gram.lever, middle=hand_eye.middle)
     with_pose = [relative_U(np.concatenate([jacobians_taken, J[None]])) for J in jacobians_proposed]
     best = int(np.argmin(with_pose))

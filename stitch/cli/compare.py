@@ -206,8 +206,9 @@ def _chance_text(comparison: ResidualTables, table: ResidualTable) -> str:
 
 def _group_names(group: Sequence[ResidualTable]) -> str:
     """Return j2, torque 2_2 and torque 2_3: tables whose bins hold the same."""
-    *others, last = [table.name for table in group]
-    return f"{', '.join(others)} and {last}" if others else last
+    from stitch.numerics.units import listed
+
+    return listed([table.name for table in group], "and")
 
 
 def _worst_rows(table: ResidualTable, state: RunData, to_um: float) -> str:

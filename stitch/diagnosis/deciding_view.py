@@ -480,8 +480,8 @@ def _further_scans(linear: LinearModel, surfaces: SurfaceObservation, joints: Ar
         errors = _with_drift(errors, both, linear.measurement, surfaces.centre)
     hand_eye = hand_eye_jacobian(both.capture, linear.model.T_mount, surfaces.centre)
     columns = np.hstack([hand_eye, _used_columns(linear, both, surfaces.centre)])
-    to_centre = frames.make(np.eye(3), -surfaces.centre)
-    return _FurtherScans(surfaces, both, columns, errors, frames.adjoint(to_centre @ both.capture.T_reference_flange))
+    flange = frames.adjoint_about(surfaces.centre, both.capture.T_reference_flange)
+    return _FurtherScans(surfaces, both, columns, errors, flange)
 
 
 def _with_drift(errors: PoseErrors, both: Measurement, taken: Measurement, centre: Array) -> PoseErrors:

@@ -25,9 +25,9 @@ from stitch.diagnosis.ranking import Ranked, conditioned_on_effects
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
-from stitch.effects.contract import EFFECTS, Effect, by_joint, parameters_in, twist
+from stitch.effects.contract import EFFECTS, Effect, by_joint, twist
 from stitch.model.forward import moves_points, pose_derivatives
-from stitch.model.model import Model, Term
+from stitch.model.model import Model, Term, term_of
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.reml import NOISE
@@ -125,7 +125,7 @@ def expected_in_view(
     # Scatter moves a view by a twist of the flange, carried to the surface's centre.
     base = model_beside(linear, rivals[0])
     flange = build_capture("candidate", (), further.T_base_flange, further.mount).T_reference_flange
-    by_flange = to_height @ frames.adjoint(frames.make(np.eye(3), -base.observation.centre) @ flange)[0]
+    by_flange = to_height @ frames.adjoint_about(base.observation.centre, flange)[0]
     variances = np.repeat(np.maximum(base.flange_scatter(base.null), 1e-300), 3)
     return float(at), float(np.sqrt(by_flange**2 @ variances)), expected
 
@@ -137,10 +137,10 @@ def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement
     """
     bare = Model(linear.model.T_mount)
     if motion.joint is not None:
-        offset = _term_at_zero(linear, EFFECTS["joint_offset"])
+        offset = term_of(linear.measurement, EFFECTS["joint_offset"])
         return next(pose_derivatives(measurement, bare, [offset], centre))[motion.joint, 0]
     if motion.twist is not None:
-        constant = _term_at_zero(linear, _CONSTANT)
+        constant = term_of(linear.measurement, _CONSTANT)
         return motion.twist @ next(pose_derivatives(measurement, bare, [constant], centre))[:, 0]
     return np.append(np.zeros(3), motion.per_unit[0, -3:])
 
@@ -416,7 +416,7 @@ def _motion(linear: LinearModel, effect: FittedEffect) -> _Motion:
     if term.effect.place == "mount":
         twists = term.effect.function(linear.measurement.views, **term.arguments)
         twist = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
-        at_constant = linear.responses([_term_at_zero(linear, _CONSTANT)])[0].columns
+        at_constant = linear.responses([term_of(linear.measurement, _CONSTANT)])[0].columns
         displacement = _displacements(linear, at_constant @ twist[:, None])[..., 0]
         # A unit displaces the views by one on average.
         length = max(float(np.mean(np.linalg.norm(displacement, axis=1))), 1e-300)
@@ -428,12 +428,7 @@ def _motion(linear: LinearModel, effect: FittedEffect) -> _Motion:
 
 def _joint_columns(linear: LinearModel) -> Array:
     """Return the response (·, n) of the observation to a turn of each joint, per rad."""
-    return linear.responses([_term_at_zero(linear, EFFECTS["joint_offset"])])[0].columns
-
-
-def _term_at_zero(linear: LinearModel, effect: Effect) -> Term:
-    """Return an effect with all its parameters in this session at value 0."""
-    return Term(effect, parameters_in(linear.measurement, effect))
+    return linear.responses([term_of(linear.measurement, EFFECTS["joint_offset"])])[0].columns
 
 
 def _repeat_for_rows(linear: LinearModel, values: Array, count: int) -> Array:

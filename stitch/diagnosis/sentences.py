@@ -14,7 +14,7 @@ from stitch.diagnosis.thresholds import ALPHA, CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.effects.contract import EFFECTS
-from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
+from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, listed, rounded
 from stitch.observations.surfaces.field_error import FieldError
 from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA
 
@@ -175,9 +175,9 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
             yield f"Poses found from such scans scatter too. {_CAUSES}"
     clear = [x.covariate for x in d.depends_on if x.p_value < CLEAR_DEPENDENCE][:3]
     if clear and not d.laws:
-        yield f"What is left follows {_listed(clear, 'and')}."
+        yield f"What is left follows {listed(clear, 'and')}."
     if d.places:
-        yield f"Whatever it follows, it acts at {_listed(d.places, 'or')}: laws elsewhere are less likely by 20 to 1."
+        yield f"Whatever it follows, it acts at {listed(d.places, 'or')}: laws elsewhere are less likely by 20 to 1."
     yield from _poses_of_unknown(d, length_unit)
     yield from _not_named(d)
     untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
@@ -256,7 +256,7 @@ def _laws_found(d: Diagnosis) -> Iterator[str]:
         return
     laws = [f"{law_in_words(law_of(r))}, by {format_amount(*law_size(d.linear, r))}" for r in d.laws]
     among = "A law does" if len(laws) == 1 else "One of these laws does, and these views cannot tell which"
-    yield f"{among}: {_listed(laws, 'or')} (p = {d.laws[0].adjusted:.1g})."
+    yield f"{among}: {listed(laws, 'or')} (p = {d.laws[0].adjusted:.1g})."
     yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."
 
 
@@ -279,11 +279,6 @@ def _scatter(translation: float, rotation: float, length_unit: str) -> str:
 def _not_named(d: Diagnosis) -> Iterator[str]:
     """Say which effects explain much and are not named, and why: an alarm that did not stand is no silence."""
     yield from (f"Not named: {note}." for note in d.notes)
-
-
-def _listed(names: Sequence[str], last: str) -> str:
-    """Return a, b and c."""
-    return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def scanner_error_sentence(error: FieldError, length_unit: str) -> str:
@@ -323,7 +318,7 @@ def curve_sentences(d: Diagnosis, length_unit: str) -> list[str]:
     sentences = [joint_curve_sentence(curve) for curve in curves]
     undecided = {curve.joint: curve.may_follow for curve in curves if len(curve.may_follow) > 1}
     sentences += [
-        f"These views do not tell whether joint {joint} follows {_listed(others, 'or')}."
+        f"These views do not tell whether joint {joint} follows {listed(others, 'or')}."
         for joint, others in undecided.items()
     ]
     return sentences if d.time_curve is None else [*sentences, time_curve_sentence(d.time_curve, length_unit)]

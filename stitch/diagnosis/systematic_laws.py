@@ -297,14 +297,13 @@ def bodies_of(linear: LinearModel) -> Iterator[tuple[str, str, Array]]:
     the body in its own frame; rotation first, rad and length_unit.
     """
     measurement = linear.measurement
-    to_centre = frames.make(np.eye(3), -linear.observation.centre)
     still = np.broadcast_to(np.eye(4), (measurement.views.count, 4, 4))
     if measurement.eye_to_hand:
         names = ("the part on the flange", "the scanner's stand or the base")
     else:
         names = ("the part or the base", "the scanner or its mount")
     for name, kind, carried in zip(names, BODIES, (still, measurement.capture.T_reference_mount), strict=True):
-        yield name, kind, frames.adjoint(to_centre @ carried)
+        yield name, kind, frames.adjoint_about(linear.observation.centre, carried)
 
 
 def _places(linear: LinearModel) -> Iterator[Place]:

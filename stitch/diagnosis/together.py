@@ -9,7 +9,7 @@ view, and time constants, are a session's own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -142,17 +142,13 @@ def together_document(together: Together, sessions: Sequence[str]) -> dict[str, 
     }
 
 
-class _Statistics(NamedTuple):
-    """What one session says of p free parameters θ of an effect: the log likelihood bᵀθ − ½ θᵀIθ + gain."""
+def _statistics(linear: LinearModel, scored: Score) -> tuple[Sequence[Parameter], Array, Array, float]:
+    """Return what one session says of an effect: of its p free parameters θ the log likelihood is bᵀθ − ½ θᵀIθ + gain.
 
-    free: Sequence[Parameter]
-    information: Array  # I (p, p)
-    vector: Array  # b (p,)
-    gain: float  # by the variances that the effect leaves there, over those of the null fit
-
-
-def _statistics(linear: LinearModel, scored: Score) -> _Statistics:
-    """Return I = Xᵀ C⁻¹ X and b = Xᵀ C⁻¹ y of an effect in one session, C at the variances that it leaves there."""
+    Returns:
+        The parameters; I = Xᵀ C⁻¹ X (p, p) and b = Xᵀ C⁻¹ y (p,), C at the variances that the effect leaves there; and
+        the gain by these variances over those of the null fit.
+    """
     variances = linear.null.variances
     # Variances of a model with other components of scatter are not this one's.
     if scored.variances is not None and len(scored.variances) == len(variances):
@@ -160,7 +156,7 @@ def _statistics(linear: LinearModel, scored: Score) -> _Statistics:
     at = replace(linear, null=at_variances(linear.mixed, variances))
     whole = scored.candidate.forms[0]
     ((information, vector),) = at.information([whole.selected])
-    return _Statistics(whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance))
+    return whole.free, information, vector, 0.5 * (linear.null.deviance - at.null.deviance)
 
 
 def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int) -> Shared:
@@ -175,14 +171,14 @@ def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int)
     """
     of_sessions = [_statistics(linear, scored) for linear, scored in zip(linears, scores, strict=True)]
     # Sessions may have different free parameters: all of them are numbered.
-    parameters = {p.name: p for session in of_sessions for p in session.free}
+    parameters = {p.name: p for free, *_ in of_sessions for p in free}
     number = {name: k for k, name in enumerate(parameters)}
     information = np.zeros((len(number), len(number)))
     vector = np.zeros(len(number))
-    for session in of_sessions:
-        rows = [number[p.name] for p in session.free]
-        information[np.ix_(rows, rows)] += session.information
-        vector[rows] += session.vector
+    for free, of_session, vector_of_session, _ in of_sessions:
+        rows = [number[p.name] for p in free]
+        information[np.ix_(rows, rows)] += of_session
+        vector[rows] += vector_of_session
     scales = regime_of(linears[0]).scales
     # The session with the most free parameters has all forms of the effect.
     longest = max((scored.candidate for scored in scores), key=lambda c: len(c.forms[0].free))
@@ -194,7 +190,7 @@ def _shared(linears: Sequence[LinearModel], scores: Sequence[Score], tests: int)
         evidence = log_evidence_at_scales(in_sizes, vector[of_form] * sizes[of_form], scales)
         log_bayes_factors.append(log_mixture(evidence, scales))
     of_all_forms = float(logsumexp(np.array(log_bayes_factors) + np.log(form_weights(longest))))
-    log_bayes_factor = of_all_forms + sum(session.gain for session in of_sessions)
+    log_bayes_factor = of_all_forms + sum(gain for *_, gain in of_sessions)
     best = rows_of_forms[int(np.argmax(log_bayes_factors))]
     free = [list(parameters.values())[k] for k in best]
     fitted = _fitted(free, information[np.ix_(best, best)], vector[best])

@@ -26,6 +26,7 @@ from stitch.numerics.folds import JointEnd, halves_of
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import mean_square_share
 from stitch.numerics.parameter_selection import log_evidence
+from stitch.numerics.units import listed
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
 
 
@@ -233,7 +234,7 @@ class Extrapolation:
 def untested_ends_reason(names: Sequence[str]) -> str:
     """Say what speaks against effects that the ends cannot judge."""
     return (
-        f"{', '.join(names[:-1])} and {names[-1]} help among the measured poses, but not beyond. Ends of "
+        f"{listed(names, 'and')} help among the measured poses, but not beyond. Ends of "
         f"joint ranges left out change by less than {1 - limits.MAX_REMAINING_SHARE:.0%} together"
     )
 

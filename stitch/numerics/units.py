@@ -1,5 +1,6 @@
 """Numbers as people read them: mm, µm below one, mrad; with the digits that are known."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -134,3 +135,8 @@ def _significant_digits(value: float, digits: int) -> str:
     """Return a number with so many significant digits, in a form with an exponent where it is very small."""
     text = f"{value:.{digits}g}"
     return _plain_decimal(float(text), digits) if abs(value) >= 1 else text
+
+
+def listed(names: Sequence[str], last: str) -> str:
+    """Return names as people list them, with a word before the last one: a, b and c."""
+    return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -28,7 +28,7 @@ from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import project_out
-from stitch.numerics.units import angle_text, display_unit, length_text
+from stitch.numerics.units import angle_text, display_unit, length_text, listed
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches
 from stitch.output.comparison.model_history import model_history
 from stitch.output.plain_finding import open_doubts, unnamed_finding
@@ -298,13 +298,12 @@ def untested_text(diagnosis: Diagnosis) -> str:
     Effects lack other poses (not observable), or data of the session, such as joint angles.
     """
     unseen = [c.name for c in diagnosis.candidates if not c.ranked.score.observable]
-    lines = [f"These views cannot show {' and '.join(unseen)}: other poses are needed."] if unseen else []
+    lines = [f"These views cannot show {listed(unseen, 'and')}: other poses are needed."] if unseen else []
     for needs in dict.fromkeys(diagnosis.missing.values()):
         names = [name for name, lacks in diagnosis.missing.items() if lacks == needs]
         were, they = ("was", "it needs") if len(names) == 1 else ("were", "they need")
-        lines.append(
-            f"{' and '.join(names).capitalize()} {were} not tested: {they} {' and '.join(map(describe_need, needs))}."
-        )
+        what = listed([describe_need(need) for need in needs], "and")
+        lines.append(f"{listed(names, 'and').capitalize()} {were} not tested: {they} {what}.")
     return " ".join(lines)
 
 

@@ -41,7 +41,6 @@ from stitch.output.schema import (
     array_of,
     list_of,
     number,
-    plain,
     table_of,
 )
 from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
@@ -49,6 +48,7 @@ from stitch.session.measurement import Measurement
 from stitch.session.scan import Stock
 from stitch.session.session import Scanner, SessionData, View
 from stitch.system.packages import stitch_version
+from stitch.system.values import plain
 
 _PACKAGES = ("numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
@@ -295,11 +295,6 @@ def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
 def _has_labelled_alone(run: RunData) -> bool:
     """Return whether the rms of the run is that of labelled points; beside clouds it is that of the surfaces."""
     return run.targets is not None and run.overlaps is None
-
-
-def _has_points_and_clouds(run: RunData) -> bool:
-    """Return whether labelled points count beside the surfaces of clouds."""
-    return run.targets is not None and run.overlaps is not None
 
 
 def _all_views(run: RunData) -> list[ViewRow]:
@@ -591,7 +586,7 @@ RESULT = Document(
     Key("targets", write=_target_rows),
     Key("position_error", _SIZES, "targets.distances", when=attrgetter("targets")),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
-    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_has_points_and_clouds),
+    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=lambda r: r.targets and r.overlaps),
     Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_has_labelled_alone),
     Key("heldout_position_error", _SIZES, "targets.heldout", when=_has_labelled_alone),
     Key("convergence", table_of(_NUMBERS), of=Fit),

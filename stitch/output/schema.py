@@ -15,15 +15,9 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.session.reading.text_files import read_text, shortened
+from stitch.system.values import plain
 
 Schema = dict[str, Any]
-
-
-def plain(value: Any) -> Any:
-    """Return an array or a tuple as a list, anything else as it is."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
 
 
 def number(value: float | None) -> float:
