@@ -21,9 +21,10 @@ from stitch.diagnosis.sensitivity import (
     unseen_shape_error,
 )
 from stitch.diagnosis.sentences import diagnosis_sentence
+from stitch.diagnosis.smooth_processes import FittedProcess
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
 from stitch.diagnosis.unmodelled_joint_effects import joint_curves
-from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors, reportable
+from stitch.diagnosis.unmodelled_time_effects import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
 from stitch.fit.pipelines import linearise
@@ -68,17 +69,7 @@ def _diagnose(state: RunData) -> Diagnosis:
     examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates))
     announce("diagnosing: errors without a name, and where the error comes from")
     is_unknown = evidence.verdict == "unknown_effect"
-    repeating = evidence.repeating_errors or ()
-    if is_unknown and (evidence.repeating_errors is None or evidence.reported_laws):
-        repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.reported_laws[:1]))
-    reported = reportable(repeating, evidence.implausible_scatter)
-    process = reported[0].process if reported else None
-    # The model in which the joint that is reported may err without a name, so that this error is no scatter.
-    joint_effects = reported[0].joint_effects if reported else ()
-    with_reported = joint_effects[0].model if joint_effects else linear
-    # The scatter beside the repeating errors that are reported; without such, all pose errors together.
-    scattering = with_reported if reported else linear.restricted(())
-    scatter = process.flange_scatter if process else scattering.flange_scatter(scattering.null)
+    repeating, with_reported, process, scatter = _errors_without_a_name(linear, evidence)
     rotation, translation = np.sqrt(scatter).tolist()
     diagnosis = Diagnosis(
         verdict=evidence.verdict,
@@ -120,6 +111,29 @@ def _diagnose(state: RunData) -> Diagnosis:
     )
     sentence = diagnosis_sentence(diagnosis, state.session.length_unit, _pair_beside_each_other(linear, evidence))
     return replace(diagnosis, sentence=sentence)
+
+
+def _errors_without_a_name(
+    linear: LinearModel, evidence: Evidence
+) -> tuple[tuple[RepeatingError, ...], LinearModel, FittedProcess | None, Array]:
+    """Return the kinds of pose errors that repeat, and what scatters beside the one that is reported.
+
+    Without a reported one all pose errors together count as scatter.
+
+    Returns:
+        The kinds; the model in which the joint that is reported may err without a name; the process in time, where
+        one is reported; and the variances (2,) per axis of the flange's scatter, rad² and length_unit².
+    """
+    repeating = evidence.repeating_errors or ()
+    if evidence.verdict == "unknown_effect" and (evidence.repeating_errors is None or evidence.reported_laws):
+        repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.reported_laws[:1]))
+    reported = next(iter(reportable(repeating, evidence.implausible_scatter)), None)
+    if reported is None:
+        scattering = linear.restricted(())
+        return repeating, linear, None, scattering.flange_scatter(scattering.null)
+    model = reported.joint_effects[0].model if reported.joint_effects else linear
+    process = reported.process
+    return repeating, model, process, process.flange_scatter if process else model.flange_scatter(model.null)
 
 
 def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, tests: int) -> list[CandidateEffect]:
