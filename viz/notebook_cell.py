@@ -6,15 +6,11 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from stitch.numerics.units import MICROMETRES
-from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.model_history import model_history
 from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE
 from viz.figures import plain
-from viz.history_figures import error_falling
-from viz.part_picture import DISAGREE, part_picture, step_shown
-from viz.part_surface import camera_for, part_surface
+from viz.part_picture import error_falling, part_picture
 from viz.run_numbers import residual_vectors
 from viz.run_page import page_with_diagnosis, report_html
 
@@ -35,23 +31,20 @@ def notebook_view(run: RunData) -> str:
 
 
 def plot(run: RunData, of: str = "part") -> Figure:
-    """Return the part at the last steps of the model, coloured by how far its views disagree (µm); of labelled points
-    alone, the targets as every view puts them.
+    """Return the part at the last steps of the model, coloured by how far its views disagree (µm).
+
+    Of labelled points alone it is the targets as every view puts them.
 
     Args:
         of: "error": how the error falls from step to step, in place of that.
     """
-    if of == "error":
-        return error_falling(run)
-    history, um = model_history(run), MICROMETRES[run.session.length_unit]
+    history = model_history(run)
     if history is None:
         return _sticks(run)
-    surface = part_surface(run.fused, history.patches)
-    camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
+    if of == "error":
+        return error_falling(run, history)
     # Coarse is so far off that all would be red.
-    shown = [step_shown(step, um) for step in history.steps[1:]]
-    full = full_colour_distance(history.models[0].field, run.session) * um
-    return part_picture(surface, camera, shown[-_STEPS:], full, DISAGREE)
+    return part_picture(run, history, history.steps[1:][-_STEPS:])
 
 
 # The longest stick covers this share of the targets' spread.

@@ -1,103 +1,95 @@
-"""The part with the field as a still picture: for paper, and where no scripts run."""
+"""The part as a still picture, once for each of some steps of the model; and how the error falls beside it."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
-from stitch.numerics.frames import Array, Indices
-from stitch.numerics.units import length_text
-from stitch.output.comparison.model_history import ModelStep
-from viz.colours import FIELD, unsigned_colours
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.model_history import ModelHistory, ModelStep, effect_changes
+from stitch.run_data import RunData
+from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
 from viz.figures import colormap
-from viz.part_surface import Camera, PartSurface
+from viz.part_surface import Camera, PartSurface, camera_for, part_surface
 
 # Light that comes from the eye, a little from above and from the left: so little shade that no colour turns into
 # another.
 _LIGHT = np.array([-0.25, 0.45, 0.86])
 _AMBIENT = 0.84
-DISAGREE = "views disagree by (µm)"
-_PIXELS = 560  # along the longer side of the picture
-_INCHES = 4.4
+# Width of one picture of the part, of the scale of colours, and of the bars beside them; inches.
+_EACH, _SCALE, _BARS = 1.9, 0.9, 3.6
 
 
-class Seen(NamedTuple):
-    """Hold the place of the surface that each pixel shows."""
-
-    shape: tuple[int, int]
-    pixel: Indices  # (P,) numbers of the pixels that show the part
-    corner: Indices  # (P, 3) vertices about the place
-    weight: Array  # (P, 3) theirs
-
-
-def step_shown(step: ModelStep, um: float) -> tuple[str, Array]:
-    """Title and values of a still picture; µm."""
-    return f"{step.name}\n{length_text(step.field.mean_abs * um / 1e3, 'mm')} on average", step.field.overall * um
-
-
-def part_picture(
-    surface: PartSurface, camera: Camera, states: list[tuple[str, Array]], limit: float, label: str
-) -> Figure:
-    """The part once for every state, title and values (K,) of the patches, with one scale of colours."""
-    seen = visible(surface, camera)
-    high, wide = seen.shape
-    inches = _INCHES / max(high, wide)
-    each = max(wide * inches, 1.9)
-    # As high as the words of the colour bar, however flat the part.
-    size = 0.9 + len(states) * each, max(high * inches, 2.0) + 0.6
-    figure = Figure(figsize=size, layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(states)))
-    for axes, (title, values) in zip(panels, states, strict=True):
-        axes.imshow(painted(surface, camera, seen, unsigned_colours(surface.coloured(values), limit)))
-        axes.axis("off")
-        axes.set_title(title, fontsize=9)
-    scale = ScalarMappable(Normalize(0, limit), colormap(FIELD))
-    figure.colorbar(scale, ax=panels, label=label, extend="max", shrink=0.8, aspect=30)
+def part_picture(run: RunData, history: ModelHistory, steps: Sequence[ModelStep]) -> Figure:
+    """Return the part once for each of some steps of the model, coloured by how far its views disagree (µm)."""
+    figure = Figure(figsize=(_EACH * len(steps) + _SCALE, 3.0), layout="constrained")
+    _draw_part(figure, run, history, steps)
     return figure
 
 
-def visible(surface: PartSurface, camera: Camera) -> Seen:
-    """Find the place of the surface that each pixel shows: of dense samples the one nearest to the eye."""
+def error_falling(run: RunData, history: ModelHistory) -> Figure:
+    """Return the part at every model of a run with effects added, and the residuals of all models beside it."""
+    width = _EACH * len(history.models)
+    figure = Figure(figsize=(width + _SCALE + _BARS, 3.6), layout="constrained")
+    parts, right = figure.subfigures(1, 2, width_ratios=[width + _SCALE, _BARS])
+    _draw_part(parts, run, history, history.models)
+    _draw_bars(right.subplots(), run)
+    return figure
+
+
+def _draw_part(figure: Figure | SubFigure, run: RunData, history: ModelHistory, steps: Sequence[ModelStep]) -> None:
+    """Draw the part once for each step into a figure, with one scale of colours."""
+    um = MICROMETRES[run.session.length_unit]
+    surface = part_surface(run.fused, history.patches)
+    camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
+    limit = full_colour_distance(history.models[0].field, run.session) * um
+    panels = np.atleast_1d(figure.subplots(1, len(steps)))
+    for axes, step in zip(panels, steps, strict=True):
+        _paint(axes, surface, camera, unsigned_colours(surface.coloured(step.field.overall * um), limit) / 255)
+        axes.set_title(f"{step.name}\n{length_text(step.field.mean_abs * um / 1e3, 'mm')} on average", fontsize=9)
+    scale = ScalarMappable(Normalize(0, limit), colormap(FIELD))
+    figure.colorbar(scale, ax=panels, label="views disagree by (µm)", extend="max", shrink=0.8, aspect=30)
+
+
+def _paint(axes: Axes, surface: PartSurface, camera: Camera, colours: Array) -> None:
+    """Draw a surface as a camera sees it, its triangles from the back to the front; colours (N, 3) of its vertices."""
     flat = surface.vertices @ camera.axes.T
-    low, size = flat.min(axis=0)[:2], np.ptp(flat, axis=0)[:2]
-    scale = (_PIXELS - 1) / float(size.max())
-    wide, high = (int(x) + 1 for x in size * scale)
-    corners, weights = _samples(surface)
-    # From the back to the front: of the samples with the same weights the last one that falls on a pixel stays.
-    corners = corners[np.argsort(flat[corners, 2].sum(axis=1))]
-    depth = np.full(high * wide, -np.inf)
-    corner, weight = np.zeros((high * wide, 3), np.int64), np.zeros((high * wide, 3))
-    at = [flat[corners[:, i]] for i in range(3)]
-    for own in weights:
-        place = sum(w * x for w, x in zip(own, at, strict=True))
-        column, row = ((place[:, :2] - low) * scale + 0.5).astype(np.int64).T
-        pixel = (high - 1 - np.clip(row, 0, high - 1)) * wide + np.clip(column, 0, wide - 1)
-        nearer = np.flatnonzero(place[:, 2] > depth[pixel])
-        depth[pixel[nearer]], corner[pixel[nearer]], weight[pixel[nearer]] = place[nearer, 2], corners[nearer], own
-    shown = np.flatnonzero(depth > -np.inf)
-    return Seen((high, wide), shown, corner[shown], weight[shown])
-
-
-def painted(surface: PartSurface, camera: Camera, seen: Seen, colours: Array) -> Array:
-    """(H, W, 4) shaded picture of colours (N, 3) of the vertices, 0 … 255; clear where there is no part."""
     light = _LIGHT @ camera.axes / np.linalg.norm(_LIGHT)
-    shade = _AMBIENT + (1 - _AMBIENT) * np.clip(surface.normals @ light, 0, 1)
-    own = np.einsum("pc,pci->pi", seen.weight, (colours * shade[:, None])[seen.corner])
-    picture = np.zeros((seen.shape[0] * seen.shape[1], 4), np.uint8)
-    picture[seen.pixel] = np.column_stack([own, np.full(len(own), 255.0)])
-    return picture.reshape(*seen.shape, 4)
+    shaded = colours * (_AMBIENT + (1 - _AMBIENT) * np.clip(surface.normals @ light, 0, 1))[:, None]
+    if len(surface.triangles):
+        triangles = surface.triangles[np.argsort(flat[surface.triangles, 2].mean(axis=1))]
+        faces = shaded[triangles].mean(axis=1)
+        # Edges of the same colour leave no seams.
+        drawn = PolyCollection(flat[triangles, :2], facecolors=faces, edgecolors=faces, linewidths=0.4)
+        axes.add_collection(drawn)
+        drawn.set_rasterized(True)
+    else:
+        order = np.argsort(flat[:, 2])
+        axes.scatter(*flat[order, :2].T, c=shaded[order], s=1, linewidths=0)
+    axes.margins(0)
+    axes.set_aspect("equal")
+    axes.axis("off")
 
 
-def _samples(surface: PartSurface) -> tuple[Indices, Array]:
-    """Corners (T, 3) of the triangles and weights (S, 3) of samples in each, so dense that no pixel is left out."""
-    if not len(surface.triangles):
-        index = np.arange(len(surface.vertices))
-        return np.stack([index] * 3, axis=1), np.array([[1.0, 0.0, 0.0]])
-    edges = surface.vertices[surface.triangles] - surface.vertices[np.roll(surface.triangles, 1, axis=1)]
-    longest = float(np.quantile(np.linalg.norm(edges, axis=2).max(axis=1), 0.9))
-    fine = int(np.ceil(longest * _PIXELS / float(np.ptp(surface.vertices, axis=0).max()))) + 1
-    i, j = np.meshgrid(np.arange(fine + 1), np.arange(fine + 1))
-    inside = i + j <= fine
-    return surface.triangles, np.column_stack([i[inside], j[inside], fine - i[inside] - j[inside]]) / fine
+def _draw_bars(axes: Axes, run: RunData) -> None:
+    """Draw residual and held-out residual of every model (µm), against the noise floor."""
+    um = MICROMETRES[run.session.length_unit]
+    place = np.arange(len(run.ledger))
+    for shift, values, colour, label in (
+        (-0.2, [s.residual_rms for s in run.ledger], BLUE, "in the fit"),
+        (0.2, [s.heldout_rms for s in run.ledger], GREEN, "on views left out"),
+    ):
+        bars = axes.bar(place + shift, np.array(values) * um, 0.38, color=colour, label=label)
+        axes.bar_label(bars, fmt="%.0f", fontsize=9, padding=2)
+    floor = run.ledger[-1].noise_floor * um
+    axes.axhline(floor, color="k", ls="--", lw=1.2, label=f"noise of the sensor, {floor:.0f} µm")
+    axes.set_xticks(place, [effect_changes(run.ledger, i) for i in place])
+    axes.set_ylabel("rms between views (µm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9, loc="lower left", bbox_to_anchor=(0, 1.0))
