@@ -68,33 +68,33 @@ def model_blueprint(scene: ModelScene, camera: Camera, raw: Array, moments: int)
         moments: their number.
     """
     before, after = shown_steps(scene.history)
+    # The same eye for all views of the part.
+    eye = eye_for(scene.surface.vertices, camera.axes, camera.up, _OF_PART)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
     parts = rrb.Horizontal(
-        _part("part/before", scene.title(before), scene, camera),
-        _part("part/after", scene.title(after) + unit, scene, camera),
+        _scene("part/before", scene.title(before), eye),
+        _scene("part/after", scene.title(after) + unit, eye),
         rrb.Vertical(
             _missing(),
             rrb.TextDocumentView(origin="verdict", name="What the run found"),
-            _bar("colours/field", "Views disagree by (µm)"),
+            _colour_bar(),
             row_shares=[12, 13, 5],
         ),
         column_shares=[3, 3, 2],
     )
     compare = rrb.Vertical(parts, _why(), row_shares=[5, 2], name="Before | after")
     steps = rrb.Horizontal(
-        _part("part/now", f"Where the views disagree; full colour at {scene.limit * scene.um:.3g} µm", scene, camera),
-        rrb.Spatial3DView(
-            origin="/",
-            contents=["stitched", "scans/**", "displacements"],
-            name=f"Views farthest off, displaced {scene.fitted:g} times as far (coarse: {scene.coarse:g})",
-            eye_controls=_eye(scene, camera),
-            background=_GROUND,
-            line_grid=False,
+        _scene("part/now", f"Where the views disagree; full colour at {scene.limit * scene.um:.3g} µm", eye),
+        _scene(
+            "/",
+            f"Views farthest off, displaced {scene.fitted:g} times as far (coarse: {scene.coarse:g})",
+            eye,
+            ["stitched", "scans/**", "displacements"],
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="now", name="Step of the model"),
             _bars("bars", "Each view off the others (µm)", "bars/first", "bars/views"),
-            _bar("colours/field", "Views disagree by (µm)"),
+            _colour_bar(),
             row_shares=[6, 10, 3],
         ),
         column_shares=[3, 3, 2],
@@ -124,9 +124,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, raw: Array, moments: int)
 def target_blueprint(cell: Array) -> rrb.Blueprint:
     """Targets, what was found and why | every iteration | what is missing | the cell (points, (N, 3))."""
     targets = rrb.Horizontal(
-        rrb.Spatial3DView(
-            origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
-        ),
+        _scene("targets", "Targets by the rms of their views; sticks magnified"),
         rrb.Vertical(
             _missing(),
             rrb.TextDocumentView(origin="verdict", name="What the run found"),
@@ -149,14 +147,7 @@ def target_blueprint(cell: Array) -> rrb.Blueprint:
 
 def _moments(eye: rrb.EyeControls3D | None, name: str) -> rrb.Horizontal:
     """The scans as every iteration has them | what is said of it, and the rms of all."""
-    clouds = rrb.Spatial3DView(
-        origin="/",
-        contents=["views/**", "fused"],
-        name=name,
-        eye_controls=eye,
-        background=_GROUND,
-        line_grid=False,
-    )
+    clouds = _scene("/", name, eye, ["views/**", "fused"])
     said = rrb.Vertical(
         rrb.TextDocumentView(origin="moment", name="Here"),
         rrb.TimeSeriesView(
@@ -171,20 +162,28 @@ def _moments(eye: rrb.EyeControls3D | None, name: str) -> rrb.Horizontal:
     return rrb.Horizontal(clouds, said, column_shares=[3, 2], name="Every iteration")
 
 
-def _part(origin: str, name: str, scene: ModelScene, camera: Camera) -> rrb.Spatial3DView:
+def _scene(
+    origin: str,
+    name: str,
+    eye: rrb.EyeControls3D | None = None,
+    contents: list[str] | None = None,
+    *,
+    grid: bool = False,
+) -> rrb.Spatial3DView:
+    """A picture in space on the ground of all others; what is below its origin where no contents are given."""
     return rrb.Spatial3DView(
-        origin=origin, name=name, eye_controls=_eye(scene, camera), background=_GROUND, line_grid=False
+        origin=origin,
+        contents=contents or ["$origin/**"],
+        name=name,
+        eye_controls=eye,
+        background=_GROUND,
+        line_grid=grid,
     )
 
 
-def _eye(scene: ModelScene, camera: Camera) -> rrb.EyeControls3D:
-    """The same eye for all views of the part."""
-    return eye_for(scene.surface.vertices, camera.axes, camera.up, _OF_PART)
-
-
-def _bar(origin: str, name: str) -> rrb.Spatial2DView:
+def _colour_bar() -> rrb.Spatial2DView:
     bounds = rrb.VisualBounds2D(x_range=WIDE, y_range=HIGH)
-    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
+    return rrb.Spatial2DView(origin="colours/field", name="Views disagree by (µm)", visual_bounds=bounds)
 
 
 def _bars(origin: str, name: str, *contents: str) -> rrb.BarChartView:
@@ -203,13 +202,8 @@ def _cell(points: Array) -> rrb.Vertical:
     up = np.array([0.0, 0.0, 1.0])
     aside = np.cross(up, level)
     axes = np.array([aside, np.cross(towards, aside), towards])
-    view = rrb.Spatial3DView(
-        origin="robot",
-        name="Arm at every view (red or blue: off, as Why measures it), scanner (pyramids), part (points); base frame",
-        background=_GROUND,
-        eye_controls=eye_for(points, axes, up, _OF_CELL),
-    )
-    return rrb.Vertical(view, name="The cell")
+    name = "Arm at every view (red or blue: off, as Why measures it), scanner (pyramids), part (points); base frame"
+    return rrb.Vertical(_scene("robot", name, eye_for(points, axes, up, _OF_CELL), grid=True), name="The cell")
 
 
 def _why() -> rrb.Spatial2DView:

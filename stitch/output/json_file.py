@@ -139,15 +139,15 @@ def write_json(document: Any, path: Path) -> None:
 
 def to_json(document: Any) -> str:
     """Return JSON text; JSON has no NaN and no infinity: what is not known is null."""
-    return json.dumps(_without_nan(document), indent=1, allow_nan=False)
+    return json.dumps(without_nan(document), indent=1, allow_nan=False)
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """Return a value of JSON, numbers in it that are not finite replaced by None; lists and tables at any depth."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -7,6 +7,8 @@ from typing import Any
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from stitch.output.json_file import without_nan
+
 LARGEST_BODY = 200_000  # bytes
 
 
@@ -28,7 +30,7 @@ async def json_object(request: Request) -> dict[str, Any] | None:
 
 def json_response(value: Any) -> Response:
     """Plain data; what is not known is null."""
-    return JSONResponse(_finite(value))
+    return JSONResponse(without_nan(value))
 
 
 def error_response(text: str, status: int = 400) -> Response:
@@ -46,12 +48,3 @@ async def fault(_: Request, error: Exception) -> Response:
     text = f"unexpected {type(error).__name__}: {error}; a fault of stitch"
     print(f"stitch: {text}", file=sys.stderr, flush=True)
     return error_response(text, 500)
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and value - value != 0 else value

@@ -104,11 +104,6 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
             for row in follows
         ],
         "next": [{"do": row["do"], "separates": row["separates"]} for row in document.get("next", [])],
-        "budget": [
-            {"source": row["source"], "share": row["variance_share"]}
-            for row in document.get("budget", [])
-            if row["variance_share"] and row["variance_share"] > 0.005
-        ],
     }
 
 
@@ -235,7 +230,6 @@ def _read(run: Path, version: str) -> Snapshot:
         "version": version,
         "model": model,
         "run": str(run),
-        "session": result["session"],
         "name": result.get("name", Path(result["session"]).name),
         "sentence": shorten_doubts(result.get("plain") or result["verdict"], doubts),
         "evidence": " ".join([*doubts, result["verdict"]]),
