@@ -12,7 +12,7 @@ import rerun as rr
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts, posterior_text
 from stitch.numerics.units import MICROMETRES
-from stitch.output.plain_finding import next_step_line, plain_finding, remedy_at_machine
+from stitch.output.plain_finding import next_step_line, remedy_at_machine
 from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
@@ -27,7 +27,7 @@ _SHOWN = 8
 NOT_YET = "Not diagnosed yet: `stitch diagnose RUN` says which effect is missing."
 
 
-def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: SessionData, path: Path) -> None:
+def add_diagnosis(found: Diagnosis, screen: dict[str, Any], session: SessionData, path: Path) -> None:
     """Put a diagnosis into a recording, in place of an earlier one; nothing where there is no recording.
 
     Args:
@@ -56,22 +56,19 @@ def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: Sess
         own.unlink(missing_ok=True)
 
 
-def log_diagnosis(
-    rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, session: SessionData
-) -> None:
+def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any], session: SessionData) -> None:
     """Verdict with the table of candidate effects, bars of the evidence, displacements of the views."""
     length_unit = session.length_unit
     um = MICROMETRES[length_unit]
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
     posteriors = {c.name: c.ranked.posterior for c in shown}
     posterior = partial(posterior_text, found.verdict, found.effects, posteriors)
-    told = [] if screen is None else screen["candidates"]
-    on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in told if c["mean"] is not None}
-    plain = plain_finding(found, length_unit) if screen is None else screen["headline"]
-    proof = [] if screen is None else [screen["proof"], f"How sure: {screen['certainty']}", remedy_at_machine(found)]
-    rec.log("diagnosis/plain", words("\n\n".join([f"**{plain}**", *proof])), static=True)
+    on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in screen["candidates"] if c["mean"] is not None}
+    headline = f"**{screen['headline']}**"
+    proof = [screen["proof"], f"How sure: {screen['certainty']}", remedy_at_machine(found)]
+    rec.log("diagnosis/plain", words("\n\n".join([headline, *proof])), static=True)
     courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]
-    lines = [f"**{plain}**", "", found.sentence, "", *courses, f"{next_step_line(found, 'RUN')}", ""]
+    lines = [headline, "", found.sentence, "", *courses, next_step_line(found, "RUN"), ""]
     lines += [
         "| | candidate effect | p | posterior | on the part if added (µm) | size |",
         "|---:|---|---:|---:|---:|---|",
@@ -84,7 +81,7 @@ def log_diagnosis(
     lines += ["", *(f"- {effect_in_words(c.name)}" for c in shown if effect_description(c.name))]
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     rec.log("diagnosis/verdict", words("\n".join(lines)), static=True)
-    if screen is not None and screen["why"] is not None:
+    if screen["why"] is not None:
         log_course(rec, screen["why"], session.names, um)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)

@@ -58,11 +58,6 @@ class Moments:
         self.sessions: list[SessionData] = []  # with all views, and after each round that left some out
         self.found: list[Moment] = []
 
-    @property
-    def whole(self) -> SessionData | None:
-        """The session with the views that were left out; None before the start."""
-        return self.sessions[0] if self.sessions else None
-
     def start(self, session: SessionData) -> None:
         """Keep the views that count from here on."""
         self.sessions.append(session)

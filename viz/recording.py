@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.model_history import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline
-from stitch.run_data import RunData, StageResult
-from stitch.session.session import SessionData
+from stitch.run_data import RunData
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
@@ -55,27 +53,15 @@ def run_markdown(run: RunData, history: ModelHistory | None) -> str:
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
-class RerunRecorder:
-    """A `stitch.recorder.Recorder` that writes one .rrd file when the run has ended.
+class RerunRecorder(Moments):
+    """A `stitch.recorder.Recorder` that keeps all moments of a run, and writes one .rrd file when it has ended.
 
     One that lies there is of the models before, and its iterations are shown too.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self.path = path
-        self._moments = Moments()
-
-    def start(self, session: SessionData) -> None:
-        """Keep the views that count from here on."""
-        self._moments.start(session)
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep where an iteration has the views."""
-        self._moments.iteration(stage, index, poses, rms, gate)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """Keep where a stage has them when it ends."""
-        self._moments.stage(result, poses)
 
     def finish(self, run: RunData) -> None:
         """Log the run and close the file."""
@@ -87,9 +73,9 @@ class RerunRecorder:
             rec.log(place, words(NOT_YET), static=True)
         log_no_course(rec, NOT_YET)
         cell = log_robot(rec, run)
-        moments = self._moments.with_models(run, history, kept_moments(self.path))
+        moments = self.with_models(run, history, kept_moments(self.path))
         keep_moments(rec, moments)
-        whole = self._moments.whole or run.session
+        whole = self.sessions[0] if self.sessions else run.session
         if history is None:
             log_moments(rec, run, moments, whole, None)
             _log_targets(rec, run)

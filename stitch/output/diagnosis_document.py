@@ -9,7 +9,7 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
 from stitch.diagnosis.law_ranking import law_size
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.sentences import law_in_words
+from stitch.diagnosis.sentences import fitted_amounts, law_in_words
 from stitch.diagnosis.systematic_laws import law_of
 from stitch.diagnosis.validation import CrossValidation
 from stitch.output.finding_screen import clearest_parameter, finding_screen
@@ -69,6 +69,7 @@ def _candidate_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
             "posterior": 0.0,
             "observable": False,
             "parameters": {},
+            "amounts": "",
             "aliases": [],
             "needs": list(needs),
             "against": [],
@@ -95,6 +96,7 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
         "posterior": ranked.posterior if observable else 0.0,
         "observable": observable,
         "parameters": _parameters(ranked.score),
+        "amounts": fitted_amounts(ranked) if observable else "",
         "rms_if_added": inside,
         "heldout_rms_if_added": heldout,
         "left_out": None if validation is None else {name: getattr(validation, name) for name in _VALIDATION_FIELDS},

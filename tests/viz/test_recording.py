@@ -27,6 +27,7 @@ from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.numerics.units import length_text
 from stitch.output.comparison.model_history import model_history
+from stitch.output.finding_screen import finding_screen
 from stitch.output.result_document import result_document
 from stitch.run_data import Note
 from viz.colours import UNSEEN, signed_colours
@@ -169,7 +170,7 @@ def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
     angle, error = np.array([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
     course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle, place="joint 2")
     file = RecordingFile("stitch", tmp_path / "d.rrd")
-    log_diagnosis(file.stream, replace(found, curves=(course,)), None, session)
+    log_diagnosis(file.stream, replace(found, curves=(course,)), finding_screen(found), session)
     file.write()
     said = columns(tmp_path / "d.rrd", "TextDocument:text")["/diagnosis/verdict"][0]
     assert unbroken("Joint 2 is off by -0.1 ± 0.01 mrad at j3 = -60°, and by 0.25 ± 0.01 mrad at j3 = 40°") in said

@@ -64,9 +64,6 @@ def _change(present: Effects, target: Effects) -> dict[str, Any] | None:
 
 # A diagnosis as rows for people: candidate effects with what they should leave if added.
 
-# The clearest parameters of an effect that are told.
-_TOLD = 3
-
 
 def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
     """diagnosis.json for the browser.
@@ -141,25 +138,10 @@ def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
         "p": "–" if row["p_value"] is None else f"{row['p_value']:.1g}",
         "rms_if_added": in_um(row["rms_if_added"]),
         "heldout_if_added": in_um(row["heldout_rms_if_added"]),
-        "amounts": _amounts(row["parameters"]),
+        "amounts": row.get("amounts", ""),
         "aliases": [f"{alias['effect']} {alias['correlation']:.2f}" for alias in row["aliases"][:2]],
         "own": row.get("tier") == "user",
     }
-
-
-def _amounts(parameters: dict[str, dict[str, Any]]) -> str:
-    """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
-    tried = [
-        f"{name} = {p.get('view') or format_amount(p['value'], None, p['unit'])}"
-        for name, p in parameters.items()
-        if p["sigma"] is None
-    ]
-    fitted = {name: p for name, p in parameters.items() if p["sigma"]}
-    clearest = sorted(fitted, key=lambda name: -abs(fitted[name]["value"]) / fitted[name]["sigma"])[:_TOLD]
-    told = [
-        f"{name} = {format_amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest
-    ]
-    return ", ".join(tried + told)
 
 
 # What the page shows comes from these; a change of one is a change of the run.
