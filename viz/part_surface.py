@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 from pykdtree.kdtree import KDTree
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csr_array
 
 from stitch.errors import NoResultError
-from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.frames import Array, Indices
 from stitch.output.comparison.disagreement_field import Patches
 from stitch.output.mesh import TriangleMesh, mesh_of, spacing
 from stitch.run_data import FusedCloud
@@ -52,17 +51,12 @@ def camera_for(points: Array, normals: Array, upright: bool) -> Camera:
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
     ahead = np.cross(aside, up)
-    best, camera = -1.0, None
-    for angle in np.radians(np.arange(0, 360, 15)):
-        level = np.cos(angle) * aside + np.sin(angle) * ahead
-        towards = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
-        shown = float(np.maximum(normals @ towards, 0).sum())
-        if shown > best:
-            right = np.cross(up, towards)
-            right /= np.linalg.norm(right)
-            best, camera = shown, Camera(right, np.cross(towards, right), towards)
-    assert camera is not None
-    return camera
+    angles = np.radians(np.arange(0, 360, 15))[:, None]
+    towards = np.cos(_ELEVATION) * (np.cos(angles) * aside + np.sin(angles) * ahead) + np.sin(_ELEVATION) * up
+    best = towards[np.maximum(normals @ towards.T, 0).sum(axis=0).argmax()]
+    right = np.cross(up, best)
+    right /= np.linalg.norm(right)
+    return Camera(right, np.cross(best, right), best)
 
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
@@ -125,20 +119,21 @@ def part_shape(fused: FusedCloud) -> PartShape:
     points, normals = _thinned(fused)
     triangles = np.zeros((0, 3), np.int64)
     with suppress(NoResultError), unless_missing():
+        import igl
+
         mesh = _drawn_in(mesh_of(points, normals, _OUTSIDE), points, normals)
         points, triangles = _level_edges(*_whole_pieces(mesh))
-        normals = vertex_normals(points, triangles)
+        normals = igl.per_vertex_normals(points, triangles)
     return PartShape(points, normals, triangles)
 
 
 def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
     """Vertices and triangles without the crumbs that lie about the part."""
-    a, b, c = mesh.triangles.T
-    count = len(mesh.vertices)
-    links = coo_matrix((np.ones(2 * len(a)), (np.append(a, b), np.append(b, c))), shape=(count, count))
-    piece = connected_components(links, directed=False)[1]
-    share = np.bincount(piece[a], minlength=piece.max() + 1) / len(a)
-    kept, triangles = np.unique(mesh.triangles[share[piece[a]] > _CRUMB], return_inverse=True)
+    import igl
+
+    _, piece = igl.facet_components(mesh.triangles)
+    share = np.bincount(piece) / len(piece)
+    kept, triangles = np.unique(mesh.triangles[share[piece] > _CRUMB], return_inverse=True)
     return mesh.vertices[kept], triangles.reshape(-1, 3).astype(np.int64)
 
 
@@ -149,26 +144,20 @@ _BESIDE, _LOOSE, _STEPS = 0.6, 0.8, 10
 
 def _drawn_in(mesh: TriangleMesh, points: Array, normals: Array) -> TriangleMesh:
     """The mesh without what runs on beyond points (N, 3) with unit normals (N, 3)."""
+    import igl
+
     tree = KDTree(np.ascontiguousarray(points))
     size, nearest = spacing(points, tree), tree.query(mesh.vertices, k=1)[1].astype(np.int64)
     off = mesh.vertices - points[nearest]
     along = off - np.einsum("ni,ni->n", off, normals[nearest])[:, None] * normals[nearest]
     far = np.linalg.norm(along, axis=1)
     vertices = mesh.vertices - (np.maximum(1 - _BESIDE * size / np.maximum(far, 1e-300), 0)[:, None] * along)
-    links = _side_by_side(len(vertices), mesh.triangles)
+    links = igl.adjacency_matrix(mesh.triangles)
     loose = (far > _LOOSE * size) | (links @ (far > _LOOSE * size) > 0)
     count = np.maximum(np.asarray(links.sum(axis=1)), 1).reshape(-1, 1)
     for _ in range(_STEPS):
         vertices[loose] = 0.5 * (vertices + links @ vertices / count)[loose]
     return TriangleMesh(vertices, mesh.triangles)
-
-
-def _side_by_side(count: int, triangles: Indices) -> csr_matrix:
-    """(N, N) 1 where a triangle has a side from one of N vertices to the other."""
-    a, b = triangles[:, [0, 1, 2, 1, 2, 0]].ravel(), triangles[:, [1, 2, 0, 0, 1, 2]].ravel()
-    links = coo_matrix((np.ones(len(a), np.int32), (a, b)), shape=(count, count)).tocsr()
-    links.data[:] = 1
-    return links
 
 
 # The grid of cells leaves teeth along an edge: what is narrower than twice so many triangles is not shown.
@@ -179,8 +168,10 @@ _EDGE_STEPS, _LEFT = 12, 0.8
 
 def _level_edges(vertices: Array, triangles: Indices) -> tuple[Array, Indices]:
     """Vertices and triangles without teeth along open edges (an opening of the surface), the edges levelled."""
-    next_to = _side_by_side(len(vertices), triangles)
-    gone = _on_open_edge(vertices, triangles)[0]
+    import igl
+
+    next_to = igl.adjacency_matrix(triangles)
+    gone = _open_edges(triangles).sum(axis=1) > 0
     for _ in range(_TOOTH - 1):
         gone = gone | (next_to @ gone > 0)
     kept = ~gone
@@ -191,22 +182,21 @@ def _level_edges(vertices: Array, triangles: Indices) -> tuple[Array, Indices]:
         return vertices, triangles
     used, own = np.unique(triangles[inside], return_inverse=True)
     vertices, triangles = vertices[used].copy(), own.reshape(-1, 3).astype(np.int64)
-    on_edge, links = _on_open_edge(vertices, triangles)
+    links = _open_edges(triangles)
     # Where edges meet the corner stays.
-    along = np.flatnonzero(on_edge & (np.asarray(links.sum(axis=1)).ravel() == 2))
+    along = np.flatnonzero(links.sum(axis=1) == 2)
     for _ in range(_EDGE_STEPS):
         vertices[along] = 0.5 * vertices[along] + 0.25 * (links[along] @ vertices)
     return vertices, triangles
 
 
-def _on_open_edge(vertices: Array, triangles: Indices) -> tuple[Mask, csr_matrix]:
-    """(N,) which vertices are on an open edge, and (N, N) which of them follow one another along it."""
-    count = len(vertices)
-    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    key, times = np.unique(sides[:, 0] * count + sides[:, 1], return_counts=True)
-    a, b = key[times == 1] // count, key[times == 1] % count
-    links = coo_matrix((np.ones(2 * len(a)), (np.append(a, b), np.append(b, a))), shape=(count, count)).tocsr()
-    return np.asarray(links.sum(axis=1)).ravel() > 0, links
+def _open_edges(triangles: Indices) -> csr_array:
+    """(N, N) 1 where two of N vertices follow one another along an open edge."""
+    import igl
+
+    a, b = igl.boundary_facets(triangles)[0].T
+    count = int(triangles.max()) + 1
+    return csr_array((np.ones(2 * len(a)), (np.append(a, b), np.append(b, a))), shape=(count, count))
 
 
 def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
@@ -224,13 +214,3 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     count = np.bincount(group)[:, None]
     point, normal = (np.stack([np.bincount(group, x) for x in v.T], axis=1) / count for v in (points, normals))
     return point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-
-
-def vertex_normals(vertices: Array, triangles: Indices) -> Array:
-    """(N, 3) unit normals, the triangles about a vertex weighed by their area."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    across = np.cross(b - a, c - a)
-    out = np.zeros_like(vertices)
-    for i in range(3):
-        np.add.at(out, triangles[:, i], across)
-    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300))
