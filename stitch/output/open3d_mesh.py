@@ -97,7 +97,7 @@ class MeshFit:
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         far = tree.query(corners.mean(axis=1))[0] > _SEEN_SPACINGS * spacing(points, tree)
         self.triangles = len(mesh.triangles)
-        self.closed = not len(_rim(mesh.triangles))  # every edge belongs to two triangles
+        self.closed = not len(igl.boundary_facets(mesh.triangles)[0])  # every edge belongs to two triangles
         self.median, self.p95 = map(float, np.quantile(distance, [0.5, 0.95]))  # of the points from the mesh
         self.unseen = float(area[far].sum() / area.sum())  # share of the area far from all points
 
@@ -120,24 +120,16 @@ def _octree_depth(points: Array) -> int:
     return int(np.ceil(np.log2(_BOX_SCALE * size / spacing(points, KDTree(np.ascontiguousarray(points, float))))))
 
 
-def _rim(triangles: Indices) -> Indices:
-    """Return the boundary of triangles (T, 3): directed edges (E, 2) that no other triangle has in reverse."""
-    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    count = int(triangles.max(initial=0)) + 1
-    # An edge (a, b) as one number, a·count + b.
-    forward = edges @ [count, 1]
-    reverse = edges[:, ::-1] @ [count, 1]
-    return edges[~np.isin(forward, reverse)]
-
-
 def _without_pinches(triangles: Indices) -> Indices:
     """Return triangles (M, 3) without those at a vertex where two openings meet.
 
     There two boundary edges begin, and openings could not be told apart. Removal may create new such vertices, hence
     the loop; it ends since triangles only become fewer.
     """
+    import igl
+
     while len(triangles):
-        pinched = np.bincount(_rim(triangles)[:, 0], minlength=triangles.max() + 1) > 1
+        pinched = np.bincount(igl.boundary_facets(triangles)[0][:, 0], minlength=triangles.max() + 1) > 1
         if not pinched.any():
             break
         triangles = triangles[~pinched[triangles].any(axis=1)]
@@ -150,9 +142,11 @@ def _large_parts(triangles: Indices) -> Indices:
     Raises:
         NoResultError: there are no triangles.
     """
+    import igl
+
     if not len(triangles):
         raise NoResultError(NO_SURFACE)
-    part = _connected(triangles[:, [0, 1, 1, 2]].reshape(-1, 2), int(triangles.max()) + 1)[triangles[:, 0]]
+    _, part = igl.facet_components(triangles)
     sizes = np.bincount(part)
     return triangles[(sizes >= _PART_SHARE * sizes.max())[part]]
 
@@ -162,18 +156,15 @@ def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
 
     Each boundary edge of an opening makes a triangle with the opening's middle, a new vertex: a fan.
     """
-    rim = _rim(triangles)
-    opening = _connected(rim, len(vertices))[rim[:, 0]]
+    import igl
+
+    rim, _, _ = igl.boundary_facets(triangles)  # directed edges (E, 2)
+    chains = coo_array((np.ones(len(rim), bool), rim.T), shape=(len(vertices), len(vertices)))
+    of_vertex = connected_components(chains, directed=False)[1]
     # Labels of connected parts, renumbered: opening 0, 1, … of each boundary edge.
-    _, opening = np.unique(opening, return_inverse=True)
+    _, opening = np.unique(of_vertex[rim[:, 0]], return_inverse=True)
     count = np.bincount(opening)[:, None]
     middles = np.column_stack([np.bincount(opening, column) for column in vertices[rim[:, 0]].T]) / np.maximum(count, 1)
     fans = np.column_stack([rim[:, ::-1], len(vertices) + opening])
     kept, triangles = np.unique(np.vstack([triangles, fans]), return_inverse=True)
     return TriangleMesh(np.vstack([vertices, middles])[kept], triangles.reshape(-1, 3))
-
-
-def _connected(edges: Indices, count: int) -> Indices:
-    """Return (count,) labels of vertices: equal where a chain of edges (E, 2) connects them."""
-    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
