@@ -172,7 +172,7 @@ class Session(SessionData):
         _require_kind("cloud_unit", cloud_unit, str | None)
         _require_kind("scanner", scanner, Scanner | Mapping | None)
         _require_kind("robot", robot, Robot | Mapping | Path | str | None)
-        path = Path(f"<{require_folder_name('name', name, 'name')}>")
+        path = Path(f"<{require_folder_name('name', name)}>")
         # Checked as a session.toml with the same entries is.
         toml = path / "session.toml"
         repeatability = StatedRepeatability()

@@ -146,12 +146,12 @@ def per_axis(kind: str, unit: str, typical: float, limit: float, axes: Sequence[
     return Spec(kind, unit, typical, limit, axes=tuple(axes))
 
 
-def per_scanner(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
+def per_scanner(unit: str, typical: float, limit: float) -> Spec:
     """Return the spec of an array (3·(K − 1),) with a vector for each of K scanners but the first: rx_right for r.
 
     The first has none: its place is the model's hand-eye.
     """
-    return Spec("scanner", unit, typical, limit, axes=tuple(axes))
+    return Spec("scanner", unit, typical, limit)
 
 
 def per_moment(unit: str, typical: float, limit: float) -> Spec:

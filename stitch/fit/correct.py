@@ -21,6 +21,7 @@ from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.hand_eye_fit import (
     HandEyeFit,
+    HandEyeSolution,
     Repeatability,
     capture_repeatability,
     fit_hand_eye,
@@ -124,12 +125,7 @@ def correct(
     T_first = first.T_mount
     require_near_scanner(captures, T_first)
     # With large pose errors the step is not linear, and what is not would count as noise: hence a second one.
-    captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, first.scatter, strict=True)]
-    # The new noise factor changes how clouds weigh beside labelled points: where there are such, views are moved anew.
-    unconstrained = tuple(
-        f.relative_to(c.poses(T_first)) if c.sightings is None else unconstrained_poses(c, c.poses(T_first), gate)
-        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
-    )
+    captures, unconstrained = _linearised_about(first, captures, unconstrained, gates)
     # Errors of several scanners do not weigh here: their places are fitted from this hand-eye on, and there they do.
     solved = solve_hand_eye(captures, unconstrained, T_first)
     require_near_scanner(captures, solved.T_mount)
@@ -153,6 +149,24 @@ def correct(
         unconstrained=unconstrained,
         history=(*history, pooled_rms(final)),
         captures=tuple(captures),
+    )
+
+
+def _linearised_about(
+    first: HandEyeSolution,
+    captures: Sequence[Capture],
+    unconstrained: Sequence[UnconstrainedPoses],
+    gates: Sequence[float],
+) -> tuple[list[Capture], tuple[UnconstrainedPoses, ...]]:
+    """Return captures with the noise factor of a first solution, and their free views as seen from its hand-eye.
+
+    The noise factor changes how clouds weigh beside labelled points: where there are such, views are moved anew.
+    """
+    T_mount = first.T_mount
+    captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, first.scatter, strict=True)]
+    return captures, tuple(
+        f.relative_to(c.poses(T_mount)) if c.sightings is None else unconstrained_poses(c, c.poses(T_mount), gate)
+        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
 
 

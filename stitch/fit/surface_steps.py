@@ -170,10 +170,9 @@ def register_session(
     assert correction is not None
     model, capture, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
     poses_model = capture.poses(model.T_mount)
-    note = ""
-    if overlaps.gram.rms > coarse.rms and not correction.given:
-        note = "the robot's poses are noisy, so the fit trusts the average of all views rather than each overlap"
-    corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
+    is_noisy = overlaps.gram.rms > coarse.rms and not correction.given
+    note = "the robot's poses are noisy, so the fit trusts the average of all views rather than each overlap"
+    corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note if is_noisy else "")
     recorder.stage(corrected, poses_model)
     registration, registered = _register_views(session, correction, index, recorder, method)
     if has_whole_clouds(session):
@@ -181,8 +180,7 @@ def register_session(
         until_screened()
     clock = Clock()
     fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
-    several = int((fused.count > 1).sum())
-    note = support_note(unsupported)
+    several, note = int((fused.count > 1).sum()), support_note(unsupported)
     last = StageResult("fuse", _fused_rms(fused.residual), several, iterations=1, seconds=clock.lap(), note=note)
     recorder.stage(last, registration.poses)
     floor = noise_floor(capture, registration.overlaps, session.scanner.noise)

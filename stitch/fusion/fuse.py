@@ -68,15 +68,14 @@ class RegisteredSession:
         return intensity_scale(self.session)
 
 
-def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
+def fuse_every_point(registered: RegisteredSession) -> tuple[FusedCloud, Unsupported]:
     """Return the fused cloud of all supported points that were scanned, and how many points were left out.
 
     Support is decided for the points in memory. If these are all points, they are fused at once. Else the points are
     read from the files, slab by slab across the part, and each takes the support of its neighbour in memory; threads
     fuse several slabs at a time.
 
-    Args:
-        slab: points of a slab; a cloud of several slabs is held in temporary files.
+    A cloud of several slabs is held in temporary files.
 
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
@@ -97,7 +96,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
         return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell, T_part), dropped
     del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
-    slabs = _cut_into_slabs(registered, cell, max(1, int(place / cell)), slab)
+    slabs = _cut_into_slabs(registered, cell, max(1, int(place / cell)))
     split = np.cumsum([len(scan.points) for scan in scans])[:-1]
     parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)
     views = [_ViewInSlabs(registered, v, slabs, *part) for v, part in enumerate(parts)]
@@ -254,8 +253,8 @@ class _Slabs:
         return [np.floor(column / self.cell).astype(np.int64) for column in columns]
 
 
-def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
-    """Return slabs across the part's longest axis, each with about `slab` of the points that were scanned.
+def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int) -> _Slabs:
+    """Return slabs across the part's longest axis, each with about `_SLAB` of the points that were scanned.
 
     A slab consists of whole layers, one block thick, so that no block lies in two slabs. The points of a layer are
     estimated from those in memory: each stands for its view's number scanned over its number in memory.
@@ -263,7 +262,6 @@ def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab
     Args:
         cell: edge of a cell, length_unit.
         block: cells along an edge of a block.
-        slab: points of a slab.
     """
     thickness = block * cell
     placed = zip(registered.capture.scans, registered.poses, strict=True)
@@ -279,7 +277,7 @@ def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab
         layer = (np.floor(points[:, axis] / thickness) - first).astype(np.int64)
         count += per_point * np.bincount(layer, minlength=layers)
     # Points are counted from below: a layer belongs to the slab in which its middle point falls.
-    slab_of_layer = np.floor((np.cumsum(count) - count / 2) / slab)
+    slab_of_layer = np.floor((np.cumsum(count) - count / 2) / _SLAB)
     ends = first + np.flatnonzero(np.diff(slab_of_layer) > 0) + 1
     # The outer slabs have no end: points that are not in memory may lie beyond those that are.
     return _Slabs(cell, block, axis, np.array([-np.inf, *(block * ends), np.inf]))

@@ -17,6 +17,8 @@ Mask = NDArray[np.bool_]
 
 # Below this angle (rad) the closed forms lose digits; their Taylor series to θ⁴ are exact there.
 _SMALL_ANGLE = 1e-3
+# Elements of a matrix that was written with six digits are off by less.
+_RIGID = 1e-5
 
 
 def skew(v: Array) -> Array:
@@ -195,14 +197,14 @@ def nearest_rotation(matrix: Array) -> Array:
     return U @ Vt
 
 
-def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
-    """Return True if a matrix (4, 4) is a proper rigid motion within `tolerance`."""
+def is_rigid(T: Array) -> bool:
+    """Return True if a matrix (4, 4) is a proper rigid motion within `_RIGID`."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]
-    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < tolerance
-    return bool(orthonormal and np.linalg.det(R) > 0 and np.abs(T[3] - [0, 0, 0, 1]).max() < tolerance)
+    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < _RIGID
+    return bool(orthonormal and np.linalg.det(R) > 0 and np.abs(T[3] - [0, 0, 0, 1]).max() < _RIGID)
 
 
 def angle_between(T_a: Array, T_b: Array) -> Array:

@@ -11,7 +11,7 @@ flange and a sensor in the cell: A = T_base_flange, X = T_flange_probe, Z = T_ba
 camera on the flange and a board in the cell: A = T_base_flange, X = T_flange_camera, Z = T_base_board,
 B = T_board_camera.
 
-`weights`, if given, multiply the squares of each motion or view. Half turns, of the motions or of X, are like any other
+Half turns, of the motions or of X, are like any other
 angle here: a rotation by θ ≤ π about n is also one by 2π − θ about −n, near half turns noise decides which of the two
 the logarithm returns, for A and for B apart, and a solver that pairs their axes needs the same one.
 """
@@ -35,27 +35,26 @@ _HALF_TURN = 0.5
 _CLEAR = 1.5
 
 
-def park_martin(A: Array, B: Array, weights: Array | None = None) -> Array:
+def park_martin(A: Array, B: Array) -> Array:
     """Return X (4, 4) of A·X = X·B from motions (M, 4, 4): logs of rotations, orthogonal Procrustes.
 
     Park & Martin 1994, IEEE Trans. Robotics and Automation 10:717.
 
-    R minimises Σ w |α − R β|² over rotation vectors α of A and β of B; the translation follows by least squares.
+    R minimises Σ |α − R β|² over rotation vectors α of A and β of B; the translation follows by least squares.
 
     Args:
         A, B: (M, 4, 4) motions of the mount frame and of the scanner frame between the same views.
-        weights: (M,) w on the squares of each motion; None: all are equal.
 
     Raises:
         NoResultError: no rotation, or rotations about one axis alone.
     """
     require_motion(A)
     alpha, beta = matched_rotations(A, B)
-    R = frames.nearest_rotation((weight_roots(A, weights)[:, None] ** 2 * alpha).T @ beta)
-    return frames.make(R, _hand_eye_translation(A, B, R, weights))
+    R = frames.nearest_rotation(alpha.T @ beta)
+    return frames.make(R, _hand_eye_translation(A, B, R))
 
 
-def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
+def andreff(A: Array, B: Array) -> Array:
     """Return X (4, 4) of A·X = X·B, rotation and translation together, by Kronecker products.
 
     Andreff, Horaud & Espiau 1999. Their system fixes the length of vec R by t_A alone and has only the zero solution
@@ -63,28 +62,25 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
 
     Args:
         A, B: (M, 4, 4) motions of the mount frame and of the scanner frame between the same views.
-        weights: (M,) on the squares of each motion; None: all are equal.
 
     Raises:
         NoResultError: no rotation, or rotations about one axis alone.
     """
     require_motion(A)
-    eye = np.eye(3)
     # Lengths and rotation entries share one system: count lengths in units of the motions.
-    unit = float(np.linalg.norm(weight_roots(A, weights)[:, None] * B[:, :3, 3])) or 1.0
+    unit = float(np.linalg.norm(B[:, :3, 3])) or 1.0
     # Rows: vec R − (R_A ⊗ R_B) vec R = 0 and (1 ⊗ t_Bᵀ) vec R + (1 − R_A) t = t_A, with row-major vec.
-    of_rotation, of_translation, right = [], [], []
-    for a, b, root in zip(A, B, weight_roots(A, weights), strict=True):
-        of_rotation += [root * (np.eye(9) - np.kron(a[:3, :3], b[:3, :3])), root * np.kron(eye, b[None, :3, 3]) / unit]
-        of_translation += [np.zeros((9, 3)), root * (eye - a[:3, :3])]
-        right += [np.zeros(9), root * a[:3, 3] / unit]
-    system, target, Q = np.vstack(of_rotation), np.concatenate(right), np.linalg.qr(np.vstack(of_translation))[0]
+    turned = np.eye(9) - np.einsum("mij,mkl->mikjl", A[:, :3, :3], B[:, :3, :3]).reshape(-1, 9, 9)
+    shifted = np.einsum("ij,mk->mijk", np.eye(3), B[:, :3, 3] / unit).reshape(-1, 3, 9)
+    system = np.concatenate([turned, shifted], axis=1).reshape(-1, 9)
+    target = np.pad(A[:, :3, 3] / unit, ((0, 0), (9, 0))).ravel()
+    Q = np.linalg.qr(np.pad(np.eye(3) - A[:, :3, :3], ((0, 0), (9, 0), (0, 0))).reshape(-1, 3))[0]
     # The translation is eliminated; what it cannot explain is left for the rotation.
     system, target = system - Q @ (Q.T @ system), target - Q @ (Q.T @ target)
     vec = minimise_on_sphere(system.T @ system, system.T @ target, np.sqrt(3.0)).reshape(3, 3)
     # Without t_A both signs of vec R solve the system; a rotation has determinant +1.
     R = frames.nearest_rotation(vec * np.sign(np.linalg.det(vec)))
-    return frames.make(R, _hand_eye_translation(A, B, R, weights))
+    return frames.make(R, _hand_eye_translation(A, B, R))
 
 
 def shah(A: Array, B: Array, weights: Array | None = None) -> tuple[Array, Array]:
@@ -155,7 +151,7 @@ def motions_from_first(G: Array) -> Array:
 
 
 def weight_roots(A: Array, weights: Array | None) -> Array:
-    """Return square roots (M,) of the weights of the motions, ones without weights."""
+    """Return square roots (V,) of the weights of poses or motions A, ones without weights."""
     return np.ones(len(A)) if weights is None else np.sqrt(np.asarray(weights, float))
 
 
@@ -181,9 +177,9 @@ def minimise_on_sphere(H: Array, g: Array, radius: float) -> Array:
     return vectors @ x
 
 
-def _hand_eye_translation(A: Array, B: Array, R: Array, weights: Array | None = None) -> Array:
-    """Return t (3,) of X from (R_A − 1) t = R t_B − t_A, weighted least squares over all motions."""
-    return _solve_translation(A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3], weights)
+def _hand_eye_translation(A: Array, B: Array, R: Array) -> Array:
+    """Return t (3,) of X from (R_A − 1) t = R t_B − t_A, least squares over all motions."""
+    return _solve_translation(A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3])
 
 
 def _solve_translation(left: Array, right: Array, weights: Array | None = None) -> Array:

@@ -274,13 +274,9 @@ def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Arra
     return unit * (vectors[:, keep] @ projected)
 
 
-def symmetric_inverse(matrix: Array, relative: float = 1e-10) -> Array:
-    """Return the inverse (k, k) of a symmetric matrix of mixed units; zero in directions of almost no information.
-
-    Args:
-        relative: eigenvalues below this share of the largest, at unit diagonal, count as zero.
-    """
-    return _pseudo_inverse(*equilibrated(matrix), relative)
+def symmetric_inverse(matrix: Array) -> Array:
+    """Return the inverse (k, k) of a symmetric matrix of mixed units; zero in directions of almost no information."""
+    return _pseudo_inverse(*equilibrated(matrix), relative=1e-10)
 
 
 def summed_squares(blocks: Array) -> Array:

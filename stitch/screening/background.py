@@ -6,7 +6,6 @@ did. A cable, a clamp or an operator's arm belongs to nothing: it stands where o
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -123,18 +122,9 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
     return gaps.max(axis=1, initial=0.0) < np.pi
 
 
-class StaticBackground(NamedTuple):
-    """What stands still before the scanner whatever the arm did; boxes are two corners, scanner frame."""
-
-    share: float  # of all points
-    views: tuple[int, ...]  # that show it
-    box: Array  # (2, 3)
-    within: Array | None  # (2, 3) with the part and without the background; None: no axis-parallel plane parts the two
-
-
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
-) -> StaticBackground | None:
+) -> tuple[float, tuple[int, ...], Array, Array | None] | None:
     """Return what stands still before the scanner whatever the arm did; None if it is too little.
 
     A point stands still if most views whose pose moves it show it at the same place before the scanner. A panel that
@@ -145,6 +135,10 @@ def find_static_background(
         poses: (V, 4, 4) T_reference_scanner under the model.
         tolerance: distance along the normal that is the same place, length_unit.
         size: of the part, length_unit.
+
+    Returns:
+        Its share of all points; the views that show it; the box (2, 3) around it, two corners, scanner frame; and a box
+        with the part and without it, None where no axis-parallel plane parts the two.
     """
     probes = [sample_points(scan, _BACKGROUND_PROBES) for scan in scans]
     points = [scan.points[index] for scan, index in zip(scans, probes, strict=True)]
@@ -168,7 +162,7 @@ def find_static_background(
     views = tuple(v for v, mask in enumerate(stays) if mask.any())
     background = every[still & ~on_part]
     within = _box_beyond_part(every[on_part & ~still], background, _bounding_box(every), size)
-    return StaticBackground(float(np.mean(still & ~on_part)), views, _bounding_box(background), within)
+    return float(np.mean(still & ~on_part)), views, _bounding_box(background), within
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:

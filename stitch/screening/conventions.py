@@ -100,7 +100,7 @@ def fit_hypotheses(
     if len(motions.pairs) < FEWEST:
         return []
     length = TRANSLATION_M / METRES[length_unit]
-    kept = distinct(screen_hypotheses(tried, motions), 1e-3, 1e-3 * length)
+    kept = distinct(screen_hypotheses(tried, motions), 1e-3 * length)
     return [fit_motions(h, motions, length, scaled=scaled) for h in kept]
 
 

@@ -230,6 +230,8 @@ _OTHER_MOUNT: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand":
 MOST_EXCHANGED = 24
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
+# Elements of the rotations of two motions that are one differ by less.
+_SAME_TURN = 1e-3
 
 
 def sentence(mistake: str, **words: Any) -> str:
@@ -455,21 +457,20 @@ def _row_mistakes(
         yield replace(stated.undone("rows", stated.T_base_flange[order]), rows=(a, b))
 
 
-def distinct(tried: Sequence[Hypothesis], angle: float, length: float) -> list[Hypothesis]:
+def distinct(tried: Sequence[Hypothesis], length: float) -> list[Hypothesis]:
     """Return the hypotheses without those that have the same relative motions as an earlier one.
 
     Those that do not use all views are all kept.
 
     Args:
-        angle: largest difference of an element of a rotation that counts as the same (rad).
-        length: largest difference of a translation, length_unit.
+        length: largest difference of a translation, length_unit; that of an element of a rotation is `_SAME_TURN`.
     """
     kept = list[Hypothesis]()
     signatures = np.empty((len(tried), 0))
     for h in tried:
         relative = frames.inverse(h.T_reference_mount[:1]) @ h.T_reference_mount[1:]
         # Twelve numbers a motion: those of the first one tell most hypotheses apart, and are compared first.
-        turned_and_moved = [relative[:, :3, :3].reshape(-1, 9) / angle, relative[:, :3, 3] / length]
+        turned_and_moved = [relative[:, :3, :3].reshape(-1, 9) / _SAME_TURN, relative[:, :3, 3] / length]
         signature = np.concatenate(turned_and_moved, axis=1).ravel()
         if not signatures.size:
             signatures = np.empty((len(tried), len(signature)))

@@ -130,13 +130,14 @@ def background_problems(session: SessionData, snooping: Snooping) -> list[Sessio
     model_poses = snooping.capture.poses(snooping.T_mount)
     background = find_static_background(scans, model_poses, snooping.tolerance, size)
     if background is not None:
-        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *background.box, strict=True))
+        share, views, box, within = background
+        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *box, strict=True))
         how = f"cut {', '.join(sides)} {session.length_unit} out of the scans"
-        if background.within is not None:
-            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in background.within)
+        if within is not None:
+            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in within)
             how = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
-        showing = [names[v] for v in background.views]
-        return [problem("background", showing, share=background.share, count=len(showing), how=how)]
+        showing = [names[v] for v in views]
+        return [problem("background", showing, share=share, count=len(showing), how=how)]
     if snooping.left_out or snooping.steps:
         # The part itself stands elsewhere where a view is off; without that view it is asked again.
         return []
@@ -145,7 +146,7 @@ def background_problems(session: SessionData, snooping: Snooping) -> list[Sessio
         return []
     views, share = occluder
     named = [names[v] for v in views]
-    show = "shows" if len(views) == 1 else "show"
+    show = "shows" if len(named) == 1 else "show"
     return [problem("in the way", named, share=share, where=list_views(named, names), show=show)]
 
 

@@ -145,7 +145,7 @@ def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, le
     if ranked:
         yield from (fit.hypothesis for fit in ranked[:_MAX_HYPOTHESES] if fit.scale == 1.0)
     else:
-        yield from distinct(hypotheses(session, rows), 1e-3, 0.1 * length)[1:]
+        yield from distinct(hypotheses(session, rows), 0.1 * length)[1:]
     stated = stated_hypothesis(session, rows)
     for factor, units in UNITS.items():
         T = np.array(stated.T_base_flange)

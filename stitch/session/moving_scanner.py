@@ -8,6 +8,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.odometry import hand_eye_of_stream, is_stream
+from stitch.session.axis_poses import require_placed
 from stitch.session.session import Cloud, SessionData, View
 from stitch.session.thinning import thin_cloud
 
@@ -22,8 +23,10 @@ def deskew_session(session: SessionData) -> SessionData:
     found from the odometry of the scans, if the scanner never stopped; else it is the stated one.
 
     Raises:
-        InputError: a view or a point without time, times that do not rise, too few views, or no hand-eye.
+        InputError: a view or a point without time, times that do not rise, too few views, an axis of unknown place, or
+            no hand-eye.
     """
+    require_placed(session)
     where = session.path / "session.toml"
     times = [view.time_s for view in session.views]
     if None in times or len(times) < _FEWEST or np.any(np.diff(np.array(times, float)) <= 0):

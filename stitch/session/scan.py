@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -214,21 +214,17 @@ def _estimate_spacing(points: Array, tree: Any) -> float:
     return float(np.median(distance[:, 1]))
 
 
-class LocalPlanes(NamedTuple):
-    """Planes fitted to N neighbourhoods of points."""
-
-    centroid: Array  # (N, 3) of the neighbours
-    normals: Array  # (N, 3) unit, of either sign
-    variation: Array  # (N,) smallest eigenvalue of the neighbours' covariance over the sum of all, 0 … 1/3
-    sigma: Array  # (N,) standard deviation of the neighbours about the plane, length_unit
-
-
-def fit_planes(points: Array, index: Indices) -> LocalPlanes:
+def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Array]:
     """Return the planes fitted to N neighbourhoods by least squares.
 
     Args:
         points: (M, 3).
         index: (N, k) indices of the points of each neighbourhood.
+
+    Returns:
+        The centroid (N, 3) of the neighbours; unit normals (N, 3) of either sign; the variation (N,), the smallest
+        eigenvalue of the neighbours' covariance over the sum of all, 0 … 1/3; and the standard deviation (N,) of the
+        neighbours about the plane, length_unit.
     """
     centroid, normals = np.empty((len(index), 3)), np.empty((len(index), 3))
     variation, sigma = np.empty(len(index)), np.empty(len(index))
@@ -247,7 +243,7 @@ def fit_planes(points: Array, index: Indices) -> LocalPlanes:
         normals[at], variation[at] = _weakest_directions(C)
         # The smallest eigenvalue is the sum of squares about the plane, which takes three degrees of freedom.
         sigma[at] = np.sqrt(np.maximum(variation[at], 0) * np.trace(C) / max(len(rows) - 3, 1))
-    return LocalPlanes(centroid, normals, variation, sigma)
+    return centroid, normals, variation, sigma
 
 
 def _weakest_directions(C: Array) -> tuple[Array, Array]:
@@ -295,9 +291,12 @@ def _estimate_noise(points: Array, centres: Array, normals: Array, index: Indice
     if count <= 8:
         return float("nan")
     sample = even_indices(len(centres), _NOISE_SAMPLES)
-    quadrics = _fit_quadrics(points, centres[sample], normals[sample], index[sample])
-    degrees = count - quadrics.parameter_counts()
-    variance = (quadrics.residuals**2).sum(axis=0) / degrees
+    residuals, _, penalty, factors = _fit_quadrics(points, centres[sample], normals[sample], index[sample])
+    # Each fit has 1 + m − tr R⁴ parameters: R = (S + μW)⁻¹μW is what one of its two rounds leaves of m coefficients.
+    left = np.stack([_cholesky_solve(factors, penalty[:, j]) for j in range(len(penalty))], axis=1)
+    twice = np.einsum("ijn,jkn->ikn", left, left)
+    degrees = count - (1 + len(penalty) - np.einsum("ijn,jin->n", twice, twice))
+    variance = (residuals**2).sum(axis=0) / degrees
     # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance / (1 - 2 / (9 * degrees)) ** 3)))
 
@@ -317,31 +316,12 @@ def _bent_normals(points: Array, centres: Array, normals: Array, index: Indices)
     out = np.empty_like(normals)
     for start in range(0, len(centres), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
-        out[at] = _fit_quadrics(points, centres[at], normals[at], index[at]).normals
+        out[at] = _fit_quadrics(points, centres[at], normals[at], index[at])[1]
     return out
 
 
-class _Quadrics(NamedTuple):
-    """Quadrics fitted to the k neighbours of each of N points, with m = 5 terms beside a constant."""
-
-    residuals: Array  # (k, N) along the normals of the local planes, length_unit
-    normals: Array  # (N, 3) unit, at the points
-    penalty: Array  # (m, m, N) μW of `_fit_quadrics`
-    factors: Array  # (m, m, N) Cholesky factors of S + μW
-
-    def parameter_counts(self) -> Array:
-        """Return the effective number of parameters (N,) of each fit: 1 + m − tr R⁴.
-
-        R = (S + μW)⁻¹μW is what one of the two rounds of `_fit_quadrics` leaves of the coefficients.
-        """
-        m = len(self.penalty)
-        left = np.stack([_cholesky_solve(self.factors, self.penalty[:, j]) for j in range(m)], axis=1)
-        twice = np.einsum("ijn,jkn->ikn", left, left)
-        return 1 + m - np.einsum("ijn,jin->n", twice, twice)
-
-
-def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices) -> _Quadrics:
-    """Return quadrics fitted to the k neighbours of each of N points.
+def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices) -> tuple[Array, Array, Array, Array]:
+    """Return quadrics fitted to the k neighbours of each of N points, with m = 5 terms beside a constant.
 
     With x and y across the normal the height over the local plane is a constant plus c·(x, y, x², √2·xy, y²). The
     coefficients c are found by least squares with a small penalty, in two rounds (iterated Tikhonov): (S + μW) c = q,
@@ -354,6 +334,10 @@ def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices)
         centres: (N, 3) points to whose neighbours the quadrics are fitted.
         normals: (N, 3) unit normals of the local planes.
         index: (N, k) indices of each centre's neighbours among all points.
+
+    Returns:
+        Residuals (k, N) along the normals of the local planes, length_unit; unit normals (N, 3) at the points; μW and
+        the Cholesky factors of S + μW, (m, m, N) each.
     """
     n = normals.T
     a, b = _axes_across(n)
@@ -375,7 +359,7 @@ def _fit_quadrics(points: Array, centres: Array, normals: Array, index: Indices)
     slope /= size
     # The normal of the surface z = slope · (x, y) at the point itself.
     bent = n - slope[0] * a - slope[1] * b
-    return _Quadrics(residuals, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, penalty, factors)
+    return residuals, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, penalty, factors
 
 
 def _axes_across(normals: Array) -> tuple[Array, Array]:

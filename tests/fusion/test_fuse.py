@@ -63,7 +63,7 @@ def test_fused_cloud_lies_on_the_part():
 
 
 @pytest.mark.parametrize("effect", [None, "field_curvature", "intensity_bias", "part_growth"])
-def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
+def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect, monkeypatch):
     """The cells and how many views see each do not depend on normals: they are the same to the last one."""
     measured, _ = blade_capture
     session = session_of(measured)
@@ -73,7 +73,8 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     assert all(len(scan.points) == 1500 for scan in light.capture.scans)
     cell = float(np.median([scan.scanned_spacing for scan in light.capture.scans]))
     expected = fuse(whole.capture, whole.poses, cell, part_axes(light.capture.scans, light.poses))
-    found, _ = fuse_every_point(light, slab=4000)
+    monkeypatch.setattr("stitch.fusion.fuse._SLAB", 4000)
+    found, _ = fuse_every_point(light)
     if effect == "intensity_bias":  # mean and spread of the points in memory are not quite those of all
         assert len(found.points) == pytest.approx(len(expected.points), rel=2e-3)
         return
@@ -100,10 +101,12 @@ def test_the_number_of_slabs_does_not_matter(blade_capture, monkeypatch):
     light = registered(thin_session(session_of(measured), 2000)[0], measured)
     reads, read = [], WholeCloud.read
     monkeypatch.setattr(WholeCloud, "read", lambda whole: reads.append(whole.scan.name) or read(whole))
-    one, many = (fuse_every_point(light, slab=slab)[0] for slab in (10**9, 1500))
+    one, _ = fuse_every_point(light)
+    monkeypatch.setattr("stitch.fusion.fuse._SLAB", 1500)
+    many, _ = fuse_every_point(light)
     assert len(reads) < 3 * len(light.capture.scans)
     monkeypatch.setattr("stitch.fusion.fuse._AHEAD", 2)
-    often, _ = fuse_every_point(light, slab=1500)
+    often, _ = fuse_every_point(light)
     for name in ("points", "normals", "residual", "count"):
         assert np.array_equal(getattr(one, name), getattr(many, name), equal_nan=True)
         assert np.array_equal(getattr(one, name), getattr(often, name), equal_nan=True)

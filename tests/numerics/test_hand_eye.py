@@ -136,11 +136,3 @@ def test_two_half_turns_that_fit_two_hand_eyes_are_refused():
     )
     with pytest.raises(NoResultError, match="half turns"):
         AXXB_SOLVERS["Park-Martin"](A, A)
-
-
-@pytest.mark.parametrize("name", AXXB_SOLVERS)
-def test_a_weight_is_a_repetition(name):
-    _, A, B = turned_by([0.6, 1.0, 1.4, 2.0], 5, noise=3.0)
-    twice = AXXB_SOLVERS[name](np.concatenate([A, A[:2]]), np.concatenate([B, B[:2]]))
-    weighted = AXXB_SOLVERS[name](A, B, np.array([2.0, 2.0, 1.0, 1.0]))
-    assert np.abs(frames.log(frames.inverse(twice) @ weighted)[:3]).max() < 1e-9

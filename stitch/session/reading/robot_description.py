@@ -6,7 +6,7 @@ A wrong number would move the arm without a word. URDF counts in metres and radi
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -159,43 +159,38 @@ def robot_from_urdf(
     try:
         scale = 1 / METRES[length_unit]
         joints = _joint_chain(robot, base_link, flange_link)
-        chain = _serial_chain(robot, joints, scale)
+        before, after, mass, com, T_last_flange = _serial_chain(robot, joints, scale)
         payload_mass, payload_com = _payload_of(payload)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return Robot(
         name=str(robot.get("name", path.stem)),
         convention="urdf",
-        before=chain.before,
-        after=chain.after,
-        theta=np.zeros(len(chain.before)),
-        mass=chain.mass,
-        com=chain.com,
+        before=before,
+        after=after,
+        theta=np.zeros(len(before)),
+        mass=mass,
+        com=com,
         payload_mass=payload_mass,
         payload_com=payload_com,
         gravity=table_numbers("robot", {"gravity": gravity}, "gravity", (3,)),
         metres_per_unit=METRES[length_unit],
-        meshes=_link_meshes(robot, joints, path.parent, scale, frames.inverse(chain.T_last_flange)),
+        meshes=_link_meshes(robot, joints, path.parent, scale, frames.inverse(T_last_flange)),
     )
 
 
-class _SerialChain(NamedTuple):
-    """n revolute joints of a URDF: T_base_flange = Π before[i] · Rz(q_i) · after[i]."""
-
-    before: Array  # (n, 4, 4), length_unit
-    after: Array  # (n, 4, 4), length_unit
-    mass: Array  # (n,) kg of the link that joint i moves, with all that is fixed to it
-    com: Array  # (n, 3) its centre of mass in the frame behind after[i]: the link's own, of the last one the flange's
-    T_last_flange: Array  # (4, 4) maps the flange to the last link's frame of the URDF
-
-
-def _serial_chain(root: Element, chain: list[Element], scale: float) -> _SerialChain:
-    """Return the revolute joints of a chain, fixed joints merged into their transforms.
+def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
+    """Return the n revolute joints of a chain, T_base_flange = Π before[i] · Rz(q_i) · after[i], fixed joints merged.
 
     Args:
         root: of the document, in which the links' masses are looked up.
         chain: joints from base to flange, fixed ones among them.
         scale: length_unit per metre.
+
+    Returns:
+        before and after (n, 4, 4), length_unit; the mass (n,), kg, of the link that joint i moves, with all that is
+        fixed to it; its centre of mass (n, 3) in the frame behind after[i], the link's own, of the last one the
+        flange's; and T_last_flange (4, 4), from the flange to the last link's frame of the URDF.
 
     Raises:
         InputError: no revolute joint, or a joint of another kind.
@@ -222,7 +217,7 @@ def _serial_chain(root: Element, chain: list[Element], scale: float) -> _SerialC
     # Fixed joints behind the last revolute one lead to the flange: `after` ends there, `com` is given in its frame.
     after[-1] = after[-1] @ pending
     com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
-    return _SerialChain(np.array(before), np.array(after), np.array(mass), np.array(com), pending)
+    return np.array(before), np.array(after), np.array(mass), np.array(com), pending
 
 
 def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:

@@ -17,7 +17,7 @@ from stitch.errors import InputError, NothingMeasuredError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.axes import Axis
-from stitch.session.axis_poses import place_stated_axes, require_placed
+from stitch.session.axis_poses import place_stated_axes
 from stitch.session.moving_scanner import deskew_session
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.csv_files import read_csv_rows
@@ -105,8 +105,6 @@ def load_session(
     )
     if axes:
         session = place_stated_axes(replace(session, has_poses=has_poses), axes)
-        if scanner.moving:
-            require_placed(session)
     if scans:
         check_scale(session, cloud_unit)
     # One view alone says nothing of how the robot moved.

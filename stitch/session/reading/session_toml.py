@@ -91,7 +91,7 @@ def session_name(file: Path, document: dict[str, Any]) -> str:
         InputError: a name that cannot be that of its run's folder.
     """
     stated = optional_text(file, document, "", "name")
-    return require_folder_name(str(file), file.resolve().parent.name if stated is None else stated, "name")
+    return require_folder_name(str(file), file.resolve().parent.name if stated is None else stated)
 
 
 def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:

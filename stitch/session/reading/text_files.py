@@ -253,24 +253,23 @@ def require_name(where: str, name: str, what: str) -> str:
     return name
 
 
-def require_folder_name(where: str, name: str, what: str) -> str:
+def require_folder_name(where: str, name: str) -> str:
     """Return a name as it is, if a folder can have it: a session's name becomes that of its run's folder.
 
     Args:
         where: file, for the message.
-        what: it is the name of, for the message.
 
     Raises:
         InputError: empty, a path, hidden, or longer than a file system allows.
     """
-    require_name(where, name, what)
+    require_name(where, name, "name")
     if not name.strip() or name != name.strip() or name.startswith(".") or any(c in _RESERVED for c in name):
         raise InputError(
-            f"{where}: {what} {shortened(name)} cannot name a folder; to fix: write letters, digits, spaces or - _ +, "
+            f"{where}: name {shortened(name)} cannot name a folder; to fix: write letters, digits, spaces or - _ +, "
             "without a path"
         )
     if len(name.encode("utf-8", "replace")) > _LONGEST:
-        raise InputError(f"{where}: {what} {shortened(name)} is too long for a folder; to fix: shorten it")
+        raise InputError(f"{where}: name {shortened(name)} is too long for a folder; to fix: shorten it")
     return name
 
 

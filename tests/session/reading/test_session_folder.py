@@ -514,7 +514,7 @@ def test_what_may_not_be_read_says_so(session, monkeypatch):
 @pytest.mark.parametrize("name", ["..", ".", "../x", "/abs", "a/b", "a\\b", "", " ", ".hidden", " a", "µ" * 150])
 def test_names_that_cannot_name_a_folder_are_refused(name):
     with pytest.raises(InputError, match=r"session.toml: name .*; to fix: "):
-        require_folder_name("session.toml", name, "name")
+        require_folder_name("session.toml", name)
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a\nb", "\x1b[31m", "x" * 201])
@@ -528,7 +528,7 @@ def test_names_that_nobody_can_print_are_refused(name):
     "name", ["blade-17", "Größe µ", "[red]x[red]", ":smile:", "O'Brien & Söhne", "a..b", "x" * 200]
 )
 def test_odd_names_stay_as_they_are(name):
-    assert require_folder_name("session.toml", name, "name") == name
+    assert require_folder_name("session.toml", name) == name
 
 
 def test_a_session_without_a_name_has_that_of_its_folder(session, monkeypatch):
