@@ -59,7 +59,7 @@ _SINGLE_START_SIZE = 250
 class PointSums(Protocol):
     """Sums over correspondences for parameters of effects that move points within a view (`PointGram`)."""
 
-    def select(self, keep: slice | Mask) -> "PointSums":
+    def select(self, keep: slice | Mask | Indices) -> "PointSums":
         """Return the sums of some of the parameters."""
 
 

@@ -38,22 +38,9 @@ class PointGram:
     residual: Array  # (P, K) Σ w g e
     square: Array  # (P, K, K) Σ w g gᵀ
 
-    def select(self, keep: slice | Mask) -> "PointGram":
-        """Return the sums of some of the parameters."""
+    def select(self, keep: slice | Mask | Indices) -> "PointGram":
+        """Return the sums of some of the parameters, in the order in which `keep` names them."""
         return PointGram(self.vector[:, :, keep], self.residual[:, keep], self.square[:, keep][:, :, keep])
-
-    def merge_sides(self, per_view: int) -> "PointGram":
-        """Return the sums for parameters that all views share, from sums that count them for each view of a pair.
-
-        A is the linear map from shared parameters to those of the sums: both copies of one are its value.
-
-        Args:
-            per_view: number of parameters in the sums twice: first those of view v, then those of view w, then others.
-        """
-        shares = np.vstack([np.eye(per_view), np.eye(per_view)])
-        rest = self.residual.shape[1] - 2 * per_view
-        A = np.block([[shares, np.zeros((2 * per_view, rest))], [np.zeros((rest, per_view)), np.eye(rest)]])
-        return PointGram(self.vector @ A, self.residual @ A, A.T @ self.square @ A)
 
 
 def view_responses(

@@ -10,7 +10,6 @@ where they are most of what is shown, there is none.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from stitch.model.model import Model, Term
 from stitch.numerics.distributions import chi2_tail, tukey
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.least_squares import project_out
-from stitch.observations.surfaces.effect_columns import PointGram, apparent_twists
+from stitch.observations.surfaces.effect_columns import PointGram
 from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.surfaces.scanner_errors import (
     ALARM_SHARE,
@@ -121,13 +120,11 @@ def field_error(
     if per_view_is_clearer:
         shared = _cause_size(by_causes, SHARED, alpha / 2)
     else:
-        # The sums hold COARSE shapes of the first view of a pair and those of the second, which are one and the same
-        # here; then incidence, finer shapes, which are left out, and the nuisance effects.
-        together = sums.merge_sides(per_view=COARSE)
-        column = np.arange(together.residual.shape[1])
-        coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
-        twists = apparent_twists(coarse, unconstrained)
-        likelihood = shared_error_likelihood(coarse, twists, unconstrained, noise, nuisance)
+        # The sums hold COARSE shapes of the first view of a pair and those of the second; then incidence, finer shapes,
+        # which are left out, and the nuisance effects.
+        column = np.arange(sums.residual.shape[1])
+        coarse = sums.select((column <= 2 * COARSE) | (column >= len(column) - nuisance))
+        likelihood = shared_error_likelihood(coarse, unconstrained, noise, nuisance, per_view=COARSE)
         shared = _cause_size(likelihood, SHARED, alpha / 2)
     by_view = per_view_is_clearer or (per_view.share > 0 and not shared.share)
     return FieldError(
@@ -262,15 +259,11 @@ def _coarse_fine_likelihood(
         noise: rms of the sensor along the ray, length_unit.
         nuisance: number of the last columns of the sums: effects that may have any size.
     """
-    together = sums.merge_sides(per_view=COARSE)
-    column = np.arange(together.residual.shape[1])
-    # The sums hold COARSE shapes, the one of incidence, the others, nuisance; incidence is to come before nuisance.
-    order: Any = np.concatenate(
-        [np.delete(column[: len(column) - nuisance], COARSE), [COARSE], column[len(column) - nuisance :]]
-    )
-    shared = together.select(order)
-    twists = apparent_twists(shared, unconstrained)
-    likelihood = shared_error_likelihood(shared, twists, unconstrained, noise, nuisance)
+    column = np.arange(sums.residual.shape[1])
+    # Behind COARSE shapes of either view stand incidence, the others, nuisance; incidence is to come before nuisance.
+    shapes, last = np.delete(column, 2 * COARSE), len(column) - nuisance - 1
+    shared = sums.select(np.insert(shapes, last, 2 * COARSE))
+    likelihood = shared_error_likelihood(shared, unconstrained, noise, nuisance, per_view=COARSE)
     over_field, incidence = likelihood.design
     return replace(likelihood, design=(over_field[:, :COARSE], over_field[:, COARSE:], incidence))
 

@@ -27,7 +27,12 @@ from stitch.observations.surfaces.effect_columns import (
 )
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, SCANNER_SCALE
 from stitch.observations.surfaces.normal_equations import Gram
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums, visible_step
+from stitch.observations.surfaces.view_poses import (
+    UnconstrainedPoses,
+    solve_view_sums,
+    sum_on_views,
+    visible_step,
+)
 from stitch.session.measurement import Measurement
 
 # Degree of the polynomials over the field; finer ones are added only where views may have errors of their own, so that
@@ -100,7 +105,7 @@ def field_scatter(
         elif share is not None:
             sizes = np.full(twists.shape[1], noise * share)
         else:
-            field, incidence = shared_error_likelihood(sums, twists, unconstrained, noise).map_shares
+            field, incidence = shared_error_likelihood(sums, unconstrained, noise).map_shares
             sizes = noise * np.append(np.full(twists.shape[1] - 1, field), incidence)
         columns.append(twists * sizes)
     return np.hstack(columns)
@@ -376,25 +381,22 @@ class SmoothErrorLikelihood:
 
 
 def shared_error_likelihood(
-    sums: PointGram, twists: Array, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
+    sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0, per_view: int = 0
 ) -> SmoothErrorLikelihood:
     """Return the likelihood of smooth errors that are the same in every view: causes are the field, and incidence.
 
     Args:
-        sums: over pairs for K parameters: shapes over the field, the one of incidence, then `nuisance` others.
-        twists: (6V, K) left twists of the views that the overlaps make of each parameter.
+        sums: over pairs for shapes over the field, the one of incidence, then `nuisance` others.
         noise: of the scanner along the ray, length_unit.
         nuisance: number of the last parameters, which may have any size.
+        per_view: number of the first parameters, which the sums hold twice: for the first view of a pair, then for the
+            second.
     """
     g = unconstrained.overlaps.gram
-    of_view = twists.reshape(g.views, 6, -1)
-    v, w = g.pairs.T
-    # What motions of the views absorb is subtracted from Σ w g gᵀ. Their iteration ended a small step short of where
-    # they agree best: the same step is taken off Σ w g e.
-    M = sums.square.sum(axis=0) - np.einsum("pik,pil->kl", sums.vector, of_view[v] - of_view[w])
-    step = visible_step(g)
-    vector = sums.residual.sum(axis=0) + np.einsum("pik,pi->k", sums.vector, step[v] - step[w])
-    units = np.eye(twists.shape[1] - nuisance)
+    # What the sums hold for either view is one and the same parameter.
+    parameter = np.append(np.arange(per_view), np.arange(sums.residual.shape[1] - per_view))
+    M, vector = _equations(sums, g, np.broadcast_to(parameter, (len(g.pairs), len(parameter))))
+    units = np.eye(len(M) - nuisance)
     return _likelihood_of(M, vector, (units[:, :-1], units[:, -1:]), g, noise, nuisance)
 
 
@@ -412,9 +414,13 @@ def view_error_likelihood(
         nuisance: number of the last parameters of the sums, which may have any size.
     """
     g = unconstrained.overlaps.gram
-    parts = int(part_of_view(g.views)[-1]) + 1
-    M, vector = _part_equations(sums, g)
+    part = part_of_view(g.views)
+    parts = int(part[-1]) + 1
     # The parameters are COARSE shapes of each part, one over incidence, further shapes of all views, then the nuisance.
+    of_parts = [COARSE * part[view][:, None] + np.arange(COARSE) for view in g.pairs.astype(np.int64).T]
+    shared = COARSE * parts + np.arange(sums.residual.shape[1] - 2 * COARSE)
+    parameter = np.hstack([*of_parts, np.broadcast_to(shared, (len(g.pairs), len(shared)))])
+    M, vector = _equations(sums, g, parameter)
     K = len(M) - nuisance
     per_part, incidence, further = np.split(np.eye(K), [COARSE * parts, COARSE * parts + 1], axis=1)
     # A coarse shape that all views share is the same coefficient in every part.
@@ -428,47 +434,24 @@ def part_of_view(views: int) -> Indices:
     return np.arange(views) * min(views, _MAX_PARTS) // views
 
 
-def _part_equations(sums: PointGram, g: Gram) -> tuple[Array, Array]:
-    """Return the normal equations M f = vector, (K, K) and (K,), of smooth errors f of parts of a session.
+def _equations(sums: PointGram, g: Gram, parameter: Indices) -> tuple[Array, Array]:
+    """Return the normal equations M f = vector, (K, K) and (K,), of smooth errors f.
 
-    They are Σ w g gᵀ and Σ w g e over the pairs of views, less what motions of the views absorb. The parameters f are
-    COARSE shapes of the first part, of the second and so on, then those that all views share.
+    They are Σ w g gᵀ and Σ w g e over the pairs of views, less what motions of the views absorb.
 
     Args:
-        sums: of `sum_smooth_errors` with per_view=True: COARSE columns for the first view of a pair, as many for the
-            second, then those that all views share.
+        parameter: (P, columns) the parameter that each column of the sums of a pair stands for.
     """
-    part = part_of_view(g.views)
-    of_parts = [COARSE * part[view][:, None] + np.arange(COARSE) for view in g.pairs.astype(np.int64).T]
-    shared = COARSE * (part[-1] + 1) + np.arange(sums.residual.shape[1] - 2 * COARSE)
-    # (P, columns) the number of the parameter that each column of the sums of a pair stands for.
-    parameter = np.hstack([*of_parts, np.broadcast_to(shared, (len(g.pairs), len(shared)))])
     count = int(parameter.max()) + 1
     M, vector = np.zeros((count, count)), np.zeros(count)
     np.add.at(M, (parameter[:, :, None], parameter[:, None, :]), sums.square)
     np.add.at(vector, parameter, sums.residual)
-    by_surfaces, by_targets = (_sum_on_views(sums, g, parameter, keep, count) for keep in (~g.labelled, g.labelled))
+    by_surfaces, by_targets = sum_on_views(g, sums.vector, parameter)
     on_views = by_surfaces + by_targets
     M -= on_views.T @ solve_view_sums(g, by_surfaces, by_targets)
-    # The iteration ended a small step short of where the views agree best.
+    # The iteration of the views ended a small step short of where they agree best.
     vector += on_views.T @ visible_step(g).ravel()
     return M, vector
-
-
-def _sum_on_views(sums: PointGram, g: Gram, parameter: Indices, keep: Mask, count: int) -> Array:
-    """Return Σ w Bᵀg (6V, count), summed over pairs on their views: positive on the first view, negative on the second.
-
-    Args:
-        parameter: (P, columns) the parameter that each column of the sums of a pair stands for.
-        keep: (P,) mask of the pairs that count.
-        count: number of parameters.
-    """
-    on_views = np.zeros((g.views, count, 6))
-    v, w = g.pairs[keep].astype(np.int64).T
-    vectors = np.moveaxis(sums.vector[keep], 1, 2)
-    np.add.at(on_views, (v[:, None], parameter[keep]), vectors)
-    np.subtract.at(on_views, (w[:, None], parameter[keep]), vectors)
-    return np.moveaxis(on_views, 1, 2).reshape(6 * g.views, count)
 
 
 def _likelihood_of(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.numerics import frames
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices
 from stitch.numerics.least_squares import anderson_step
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import Gram, Overlaps, carry_overlaps, collect_overlaps, next_gate
@@ -121,16 +121,27 @@ def solve_views(g: Gram, pair_vectors: Array) -> Array:
         g: normal equations of the views, with H⁺ in the directions that they see.
         pair_vectors: Σ w Bᵀg (P, 6, K) of each pair of views; it acts on the first view and, negative, on the second.
     """
-    sums = []
-    # Surfaces and labelled points apart: their directions are judged differently.
-    for keep in (~g.labelled, g.labelled):
-        b = np.zeros((g.views, 6, pair_vectors.shape[2]))
-        v, w = g.pairs[keep].astype(np.int64).T
-        np.add.at(b, v, pair_vectors[keep])
-        np.subtract.at(b, w, pair_vectors[keep])
-        sums.append(b.reshape(6 * g.views, -1))
-    by_surfaces, by_targets = sums
-    return solve_view_sums(g, by_surfaces, by_targets)
+    every = np.broadcast_to(np.arange(pair_vectors.shape[2]), (len(g.pairs), pair_vectors.shape[2]))
+    return solve_view_sums(g, *sum_on_views(g, pair_vectors, every))
+
+
+def sum_on_views(g: Gram, pair_vectors: Array, parameter: Indices) -> tuple[Array, Array]:
+    """Return Σ w Bᵀg (6V, K) on the views, for K parameters given by pair: by overlaps of surfaces, by labelled points.
+
+    Both are judged differently, hence apart. A pair acts on its first view and, negative, on its second.
+
+    Args:
+        pair_vectors: Σ w Bᵀg (P, 6, C) of each pair of views.
+        parameter: (P, C) the parameter that each of these columns stands for; several may stand for one.
+    """
+    by_kind = np.zeros((2, g.views, int(parameter.max(initial=-1)) + 1, 6))
+    kind = g.labelled.astype(np.int64)[:, None]
+    v, w = g.pairs.astype(np.int64).T
+    vectors = np.moveaxis(pair_vectors, 1, 2)
+    np.add.at(by_kind, (kind, v[:, None], parameter), vectors)
+    np.subtract.at(by_kind, (kind, w[:, None], parameter), vectors)
+    by_surfaces, by_targets = np.moveaxis(by_kind, 2, 3).reshape(2, 6 * g.views, -1)
+    return by_surfaces, by_targets
 
 
 def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:

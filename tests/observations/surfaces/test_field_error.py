@@ -37,6 +37,7 @@ from stitch.observations.surfaces.scanner_errors import (
     field_scatter,
     part_of_view,
     scale_scatter,
+    shared_error_likelihood,
     sum_smooth_errors,
     view_error_likelihood,
 )
@@ -190,12 +191,15 @@ def sound() -> LinearModel:
 
 def test_sums_for_either_view_add_up_to_those_of_both(sound: LinearModel):
     """Sums for either view of a pair its own, added up, are those for both together."""
-    apart, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained, per_view=True)
-    together, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained)
-    coarse = apart.merge_sides(COARSE).select(slice(COARSE + 1))
-    for name in ("vector", "residual", "square"):
-        wanted = getattr(together, name)
-        np.testing.assert_allclose(getattr(coarse, name), wanted, atol=1e-9 * np.abs(wanted).max())
+    unconstrained = sound.observation.unconstrained
+    apart, noise = sum_smooth_errors(sound.measurement, unconstrained, per_view=True)
+    together, _ = sum_smooth_errors(sound.measurement, unconstrained)
+    coarse = apart.select(slice(2 * COARSE + 1))
+    added = shared_error_likelihood(coarse, unconstrained, noise, per_view=COARSE)
+    wanted = shared_error_likelihood(together, unconstrained, noise)
+    shares = np.array([0.4, 0.2])
+    for cause in range(2):
+        np.testing.assert_allclose(added.estimate(cause, shares), wanted.estimate(cause, shares), rtol=1e-6, atol=1e-9)
 
 
 def test_the_likelihood_has_the_slopes_that_it_says():
