@@ -5,7 +5,7 @@ axes and the turn of the hand-eye that explain most motions, from many random on
 rest is linear: places of rotary axes, directions of linear ones, the shift of the hand-eye. Last all together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,24 +82,30 @@ class _Motions:
     size: float  # of the part, length_unit
 
     def turned(self, directions: Array) -> Array:
-        """Return rotations (N, V, 3, 3) of T_reference_mount for N guesses at the directions (N, K, 3) of K axes.
+        """Return rotations (N, V, 3, 3) of T_reference_mount for N guesses at the directions (N, K, 3) of K axes."""
+        vectors = directions[:, None] * self.axes.readings[..., None]
+        R = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+        # A linear axis does not turn.
+        turns = [R[:, :, k] if axis.is_rotary else np.eye(3) for k, axis in enumerate(self.axes.axes)]
+        return self._carried(turns, self.reported[:, :3, :3], lambda rotation: np.swapaxes(rotation, -1, -2))
 
-        The flange's pose is A_left⁻¹ · A_right · T_base_flange, with the rotary axes' rotations as factors of A_left or
-        A_right (`Axes.stands_right`); a linear axis does not turn. With the part in hand it is inverted.
+    def _carried(self, moved: Sequence[Array], reported: Array, inverse: Callable[[Array], Array]) -> Array:
+        """Return the pose of the mount, A_left⁻¹ · A_right · T_base_flange, or its inverse for a part in hand.
+
+        Args:
+            moved: per axis A (…, d, d), by which it moves what it carries: a factor of A_left or A_right
+                (`Axes.stands_right`).
+            reported: (V, d, d) T_base_flange, or its rotation.
+            inverse: of such matrices.
         """
-        out = np.broadcast_to(self.reported[:, :3, :3], (len(directions), *self.reported[:, :3, :3].shape))
-        left = right = np.broadcast_to(np.eye(3), out.shape)
-        for k, axis in enumerate(self.axes.axes):
-            if not axis.is_rotary:
-                continue
-            vectors = directions[:, k, None, :] * self.axes.readings[None, :, k, None]
-            R = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(out.shape)
+        left = right = np.eye(reported.shape[-1])
+        for axis, A in zip(self.axes.axes, moved, strict=True):
             if self.axes.stands_right(axis):
-                right = right @ R
+                right = right @ A
             else:
-                left = left @ R
-        out = np.swapaxes(left, -1, -2) @ right @ out
-        return np.swapaxes(out, -1, -2) if self.to_hand else out
+                left = left @ A
+        T = inverse(left) @ right @ reported
+        return inverse(T) if self.to_hand else T
 
     def angles(self, directions: Array, R_mount: Array) -> Array:
         """Return angles (N, P), rad, between P motions of the scanner as registered and as N guesses predict them.
@@ -116,9 +122,9 @@ class _Motions:
     def places(self, directions: Array, R_mount: Array, use: Array) -> tuple[tuple[Axis, ...], Array] | None:
         """Return axes and hand-eye (4, 4) for given rotations: what is unknown of positions is linear least squares.
 
-        The unknowns x (3 + 6K,) are the translation of the hand-eye (3), then per axis a point (3) of a rotary one and
-        the travel per unit of the reading (3) of a linear one. Those of stated axes are not fitted. Weights make wrong
-        motions count little, repeated `_REWEIGHTED` times.
+        The unknowns are vectors (1 + K, 3): the translation of the hand-eye, then of each axis its place as in
+        `_mount_poses`, that of stated axes being known. Weights make wrong motions count little, in `_REWEIGHTED`
+        solutions.
 
         Args:
             directions: (K, 3) of the rotary axes.
@@ -130,70 +136,58 @@ class _Motions:
         """
 
         def residuals(x: Array) -> Array:
-            """Return residuals (3P,) of the translations between views, first view's scanner frame, for unknowns x."""
-            pose = self._mount_poses(directions, x) @ frames.make(R_mount, x[:3])
+            """Return residuals (3P,) of the translations between views, first view's scanner frame, at x (1 + K, 3)."""
+            pose = self._mount_poses(directions, x[1:]) @ frames.make(R_mount, x[0])
             first, second = pose[self.pairs[use, 0]], pose[self.pairs[use, 1]]
             translation = np.einsum("pji,pj->pi", first[:, :3, :3], second[:, :3, 3] - first[:, :3, 3])
             return np.asarray((translation - self.scanner[use, :3, 3]).ravel())
 
-        x = np.zeros(3 + 6 * len(self.axes.axes))
-        free = [0, 1, 2]
-        for k, axis in enumerate(self.axes.axes):
-            point, travel = 3 + 6 * k + np.arange(3), 6 + 6 * k + np.arange(3)
-            if not axis.is_placed:
-                free.extend(point if axis.is_rotary else travel)
-            elif not axis.is_rotary:
-                x[travel] = axis.direction
-            if axis.is_placed and axis.point is not None:
-                x[point] = axis.point
+        x = np.zeros((1 + len(self.axes.axes), 3))
+        for k, axis in enumerate(self.axes.axes, start=1):
+            stated = axis.point if axis.is_rotary else axis.direction
+            if axis.is_placed and stated is not None:
+                x[k] = stated
+        free = [0, *(k for k, axis in enumerate(self.axes.axes, start=1) if not axis.is_placed)]
         # They are linear in x: differences are the columns.
         at_stated = residuals(x)
-        columns = np.column_stack([residuals(x + np.eye(len(x))[i]) - at_stated for i in free])
+        units = np.eye(x.size).reshape(*x.shape, *x.shape)[free].reshape(-1, *x.shape)
+        columns = np.column_stack([residuals(x + unit) - at_stated for unit in units])
         weight = np.ones(len(at_stated))
         for _ in range(_REWEIGHTED):
             step = np.linalg.lstsq(columns * weight[:, None], -at_stated * weight, rcond=1e-4)[0]
             distances = np.linalg.norm((at_stated + columns @ step).reshape(-1, 3), axis=1)
             weight = np.repeat(1 / np.sqrt(1 + (distances / (_SHARE * self.size)) ** 2) ** 2, 3)
-        x[free] += step
+        x[free] += step.reshape(-1, 3)
         axes = []
-        for k, axis in enumerate(self.axes.axes):
-            way = x[6 + 6 * k : 9 + 6 * k]
+        for axis, direction, place in zip(self.axes.axes, directions, x[1:], strict=True):
             if axis.is_placed:
                 axes.append(axis)
             elif axis.is_rotary:
-                axes.append(replace(axis, direction=directions[k], point=x[3 + 6 * k : 6 + 6 * k]))
-            elif np.linalg.norm(way) > 0:
-                axes.append(replace(axis, direction=way / np.linalg.norm(way)))
+                axes.append(replace(axis, direction=direction, point=place))
+            elif place.any():
+                axes.append(replace(axis, direction=place / np.linalg.norm(place)))
             else:
                 return None
-        return tuple(axes), frames.make(R_mount, x[:3])
+        return tuple(axes), frames.make(R_mount, x[0])
 
-    def _mount_poses(self, directions: Array, x: Array) -> Array:
-        """Return T_reference_mount (V, 4, 4) for K axes: A_left⁻¹ · A_right · T_base_flange, or its inverse.
-
-        Each axis is a factor A of A_left or A_right (`Axes.stands_right`). The inverse is for a part in hand.
+    def _mount_poses(self, directions: Array, places: Array) -> Array:
+        """Return T_reference_mount (V, 4, 4) for K axes with these places.
 
         Args:
             directions: (K, 3) of the rotary axes.
-            x: (3 + 6K,): translation of the hand-eye, which is not used here, then per axis a point (3) of a rotary and
-                the travel per unit of the reading (3) of a linear one.
+            places: (K, 3) a point of a rotary axis, the travel per unit of the reading of a linear one.
         """
-        count = len(self.reported)
-        left = right = np.broadcast_to(np.eye(4), (count, 4, 4))
-        for k, axis in enumerate(self.axes.axes):
-            reading = self.axes.readings[:, k, None]
-            point, travel = x[3 + 6 * k : 6 + 6 * k], x[6 + 6 * k : 9 + 6 * k]
+        moved = []
+        for axis, direction, place, readings in zip(
+            self.axes.axes, directions, places, self.axes.readings.T, strict=True
+        ):
+            T = np.tile(np.eye(4), (len(readings), 1, 1))
+            T[:, :3, 3] = place * readings[:, None]
             if axis.is_rotary:
-                R = Rotation.from_rotvec(directions[k] * reading).as_matrix()
-                A = frames.make(R, point - R @ point)
-            else:
-                A = frames.make(np.broadcast_to(np.eye(3), (count, 3, 3)), travel * reading)
-            if self.axes.stands_right(axis):
-                right = right @ A
-            else:
-                left = left @ A
-        T = frames.inverse(left) @ right @ self.reported
-        return frames.inverse(T) if self.to_hand else T
+                R = Rotation.from_rotvec(direction * readings[:, None]).as_matrix()
+                T = frames.make(R, place - R @ place)
+            moved.append(T)
+        return self._carried(moved, self.reported, frames.inverse)
 
     def residual(self, axes: Axes, placement: Array, T_mount: Array) -> Array:
         """Return twists (P, 6), length_unit, between the scanner's motions as registered and as the axes predict them.

@@ -16,7 +16,7 @@ from stitch.errors import NoResultError
 from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.numerics.least_squares import least_squares
+from stitch.numerics.least_squares import symmetric_inverse
 from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.hand_eye_fit import (
@@ -260,7 +260,7 @@ def common_step(
         H, vector = assemble(o.gram)
         D += J.T @ H @ J / o.gram.scale**2
         b += J.T @ vector / o.gram.scale**2
-    xi = visible @ least_squares(visible.T @ D @ visible, visible.T @ b)
+    xi = -visible @ symmetric_inverse(visible.T @ D @ visible) @ (visible.T @ b)
     moved = [(J @ xi).reshape(-1, 6)[:, 3:] / o.gram.scale for J, o in zip(jacobians, overlaps, strict=True)]
     return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
 

@@ -14,12 +14,11 @@ from stitch.fit.sentences import ANOTHER_ARM, unfitted
 from stitch.model.forward import corrected_capture
 from stitch.model.model import (
     Model,
-    covariance_of_fit,
     kept_root,
-    known_sigmas,
     sizes_of,
     stack_parameters,
     values_of,
+    with_fitted_effects,
     with_parameter_values,
 )
 from stitch.numerics.frames import Array, Indices, Mask
@@ -97,15 +96,9 @@ def fit_surfaces(
     centres = [f.overlaps.gram.centre for f in linearised.unconstrained]
     step = linearised.solve(choice, prior_pose_errors(measurements, linearised.model, centres))
     hand_eye = step.solution
-    terms = step.model.terms
-    sigmas = known_sigmas(terms, choice.fitted, hand_eye.values_sigma)
-    kept = kept_root(terms, model.effects_covariance)
-    model = replace(
-        step.model,
-        terms=with_parameter_values(terms, values_of(terms), sigmas),
-        effects_covariance=covariance_of_fit(
-            terms, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
-        ),
+    kept = kept_root(step.model.terms, model.effects_covariance)
+    model = with_fitted_effects(
+        step.model, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
     )
     captures, unconstrained = _free_views(measurements, model, [f.overlaps.gate for f in linearised.unconstrained])
     overlaps = tuple(_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True))

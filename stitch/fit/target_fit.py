@@ -4,7 +4,7 @@ Sessions of one arm share its effects and its scatter; each has a hand-eye and t
 given nothing is fitted but the places of targets that it does not know.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -15,13 +15,13 @@ from stitch.fit.fit import WEAK, Step, fitted_parameters, iterate
 from stitch.model.forward import corrected_capture
 from stitch.model.model import (
     Model,
+    Target,
     Term,
-    covariance_of_fit,
     kept_root,
-    known_sigmas,
     sizes_of,
     stack_parameters,
     values_of,
+    with_fitted_effects,
     with_parameter_values,
 )
 from stitch.numerics.folds import grouped_folds, view_clusters
@@ -102,14 +102,13 @@ def _with_covariances(step: "TargetStep", covariance: Array, kept: Array) -> "li
         kept: (P, L) root of the covariance of the parameters of another run's arm.
     """
     of_effects = slice(step.linearised.base.shape[2], None)
-    sigmas = known_sigmas(step.model.terms, step.choice, np.sqrt(np.diag(covariance)[of_effects]))
-    terms = with_parameter_values(step.model.terms, values_of(step.model.terms), sigmas)
     sessions = []
     for session, unknowns in zip(step.solution.sessions, step.linearised.unknowns_of, strict=True):
         hand_eye = covariance[unknowns, unknowns][:6, :6]
         with_hand_eye = np.hstack([hand_eye, covariance[unknowns, of_effects][:6]])
-        effects = covariance_of_fit(terms, step.choice, covariance[of_effects, of_effects], kept, with_hand_eye)
-        model = Model(session.model.T_mount, terms, hand_eye, effects_covariance=effects)
+        model = Model(session.model.T_mount, step.model.terms, hand_eye)
+        of_fitted = covariance[of_effects, of_effects]
+        model = with_fitted_effects(model, step.choice, of_fitted, kept, with_hand_eye)
         sessions.append(replace(session, model=model))
     return sessions
 
@@ -299,24 +298,41 @@ class LinearisedTargets:
 TargetStep = Step[LinearisedTargets, TargetSolution]
 
 
-def locate_targets(measurement: Measurement, model: Model, inflation: float) -> TargetModelFit:
-    """Return the labelled points of a session, which has some, under a model that was fitted to clouds.
+def locate_targets(
+    measurement: Measurement, model: Model, inflation: float, known: Mapping[str, Target] | None = None
+) -> TargetModelFit:
+    """Return the labelled points of a session, which has some, under a model that stays as it is.
 
     Their places are fitted by least squares, nothing else is. The covariance counts the scatter of the poses, the
     sensor's noise and the hand-eye; no held-out distances are computed (NaN).
 
     Args:
         inflation: of the hand-eye's covariance, only passed on.
+        known: targets that keep their places and sigmas; None: all are fitted.
     """
     capture = corrected_capture(measurement, model)
     landmarks, blocks, variances = fit_landmarks(capture, model.T_mount)
+    assert capture.sightings is not None
+    names = capture.sightings.targets
+    given = {names.index(name): target for name, target in (known or {}).items() if name in names}
+    positions, orientation = landmarks.positions.copy(), landmarks.orientation
+    for k, target in given.items():
+        positions[k] = target.position
+        if orientation is not None and target.orientation is not None:
+            orientation = target.orientation
+    landmarks = Landmarks(positions, orientation)
     rows = target_rows(capture, model.T_mount, landmarks)
+    covariance = landmarks_covariance(blocks, rows, model.covariance).copy()
+    for k, target in given.items():
+        at = slice(3 * k, 3 * k + 3)
+        covariance[at] = covariance[:, at] = 0.0
+        covariance[at, at] = np.diag(target.sigma**2)
     distances = rows.distances(rows.residual)
     return TargetModelFit(
         model=model,
         inflation=inflation,
         landmarks=landmarks,
-        landmarks_covariance=landmarks_covariance(blocks, rows, model.covariance),
+        landmarks_covariance=covariance,
         variances=variances,
         rows=rows,
         heldout=np.full(distances.shape, np.nan),
@@ -330,34 +346,10 @@ def evaluate_targets(measurement: Measurement, model: Model) -> TargetModelFit:
     Targets that the model knows have its places and sigmas; others are fitted by least squares. Since the views have
     not fitted the model, all distances are held-out ones.
     """
-    capture = corrected_capture(measurement, model)
-    landmarks, blocks, _ = fit_landmarks(capture, model.T_mount)
-    assert capture.sightings is not None
-    known = {k: model.targets[name] for k, name in enumerate(capture.sightings.targets) if name in model.targets}
-    positions, orientation = landmarks.positions.copy(), landmarks.orientation
-    for k, target in known.items():
-        positions[k] = target.position
-        if orientation is not None and target.orientation is not None:
-            orientation = target.orientation
-    landmarks = Landmarks(positions, orientation)
-    rows = target_rows(capture, model.T_mount, landmarks)
-    covariance = landmarks_covariance(blocks, rows, model.covariance).copy()
-    for k, target in known.items():
-        at = slice(3 * k, 3 * k + 3)
-        covariance[at] = covariance[:, at] = 0.0
-        covariance[at, at] = np.diag(target.sigma**2)
-    distances = rows.distances(rows.residual)
-    nothing = rows.hand_eye[..., :0]
-    return TargetModelFit(
-        model=model,
-        inflation=1.0,
-        landmarks=landmarks,
-        landmarks_covariance=covariance,
-        variances=fit_variances(rows.mixed_model(nothing), both_starts=True).variances,
-        rows=rows,
-        heldout=distances,
-        history=(rms_of(distances),),
-    )
+    fit = locate_targets(measurement, model, 1.0, model.targets)
+    nothing = fit.rows.hand_eye[..., :0]
+    variances = fit_variances(fit.rows.mixed_model(nothing), both_starts=True).variances
+    return replace(fit, variances=variances, heldout=fit.distances)
 
 
 def _rms_of_sessions(sessions: Sequence[TargetSession]) -> float:

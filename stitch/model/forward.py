@@ -23,6 +23,8 @@ from stitch.session.robot import FlangeSlopes, Links, exact_links, flange_slopes
 # Steps of central differences, as shares of a parameter's plausible size: errors of third order stay far below the
 # noise. A parameter with a grid, as a time constant, is stepped less, since the effect is not linear in it.
 STEP, _STEP_GRIDDED = 0.1, 0.005
+# What of the chain the effects of a place change, and places whose effects add a twist to the chain's own.
+_CHANGED, _DISPLACED = {"robot": "joints", "links": "links", "axis": "axes"}, ("base", "mount", "part")
 
 
 @dataclass(frozen=True)
@@ -54,20 +56,13 @@ def true_chain(measurement: Measurement, terms: Sequence[Term], base: TrueChain 
     links = Links(*(value.copy() for value in vars(base.links).values()))
     chain = replace(base, links=links)
     for term in terms:
-        function, arguments = term.effect.function, term.arguments
-        # The function adds to what it is given; what it reads of the pose are the reported angles.
-        if term.effect.place == "robot":
-            chain = replace(chain, joints=function(chain.joints, views, **arguments))
-        elif term.effect.place == "links":
-            chain = replace(chain, links=function(chain.links, views, **arguments))
-        elif term.effect.place == "mount":
-            chain = replace(chain, mount=chain.mount + function(views, **arguments))
-        elif term.effect.place == "part":
-            chain = replace(chain, part=chain.part + function(views, **arguments))
-        elif term.effect.place == "base":
-            chain = replace(chain, base=chain.base + function(views, **arguments))
-        elif term.effect.place == "axis":
-            chain = replace(chain, axes=function(chain.axes, views, **arguments))
+        place, function, arguments = term.effect.place, term.effect.function, term.arguments
+        if place in _CHANGED:
+            # The function adds to what it is given; what it reads of the pose are the reported angles.
+            name = _CHANGED[place]
+            chain = replace(chain, **{name: function(getattr(chain, name), views, **arguments)})
+        elif place in _DISPLACED:
+            chain = replace(chain, **{place: getattr(chain, place) + function(views, **arguments)})
     return chain
 
 

@@ -264,31 +264,9 @@ def sizes_of(terms: Sequence[Term]) -> Array:
     return np.array([p.typical for p in stack_parameters(terms)], float)
 
 
-def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
-    """Return the sigmas (P,) of all parameters of all terms after a fit.
-
-    Those of the fit for parameters in it; the old ones for parameters kept from another run; NaN for the rest.
-
-    Args:
-        fitted: (P,) True for the K parameters in the fit.
-        sigmas: (K,) of these.
-    """
-    all_sigmas = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
-    all_sigmas[fitted] = sigmas
-    return all_sigmas
-
-
-def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
-    """Return the terms with other values, in the order of `stack_parameters`.
-
-    Args:
-        values: (P,) of all parameters of all terms.
-        sigmas: (P,) theirs; None: they stay.
-    """
-    ends = np.cumsum([len(term.parameters) for term in terms])[:-1]
-    values_of_terms = np.split(values, ends)
-    sigmas_of_terms = [None] * len(terms) if sigmas is None else np.split(sigmas, ends)
-    return tuple(map(Term.at, terms, values_of_terms, sigmas_of_terms))
+def with_parameter_values(terms: Sequence[Term], values: Array) -> tuple[Term, ...]:
+    """Return the terms with other values (P,) of all their parameters, in the order of `stack_parameters`."""
+    return tuple(map(Term.at, terms, np.split(values, np.cumsum([len(term.parameters) for term in terms])[:-1])))
 
 
 def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
@@ -298,31 +276,33 @@ def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
     return root[:, (root != 0).any(axis=0)]
 
 
-def covariance_of_fit(
-    terms: Sequence[Term], fitted: Mask, of_fitted: Array, kept_root: Array, with_hand_eye: Array | None = None
-) -> EffectsCovariance:
-    """Return the covariance of the P parameters of effects: of those fitted, and of those kept from another run.
+def with_fitted_effects(model: Model, fitted: Mask, of_fitted: Array, kept_root: Array, with_hand_eye: Array) -> Model:
+    """Return a model after a fit: with sigmas and covariance of the parameters fitted and of those of another run.
 
-    Parameters of zero variance, which are neither, are not in it.
+    Sigmas of all other parameters are NaN, and the covariance does not have them.
 
     Args:
         fitted: (P,) mask of the K parameters that were fitted.
         of_fitted: (K, K) covariance of these.
         kept_root: (P, L) root of the covariance of those kept, as `kept_root` returns it; zero rows for the others.
         with_hand_eye: (6, 6 + K) covariance of the hand-eye's twist ξ, T_mount·exp(ξ), with itself and with those
-            fitted; stored only with terms of tier geometry, whose places depend on both. None: it is not known.
+            fitted; stored only with terms of tier geometry, whose places depend on both.
     """
-    names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
+    sigmas = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(model.terms)], float)
+    sigmas[fitted] = np.sqrt(np.maximum(np.diag(of_fitted), 1e-300))
+    ends = np.cumsum([len(term.parameters) for term in model.terms])[:-1]
+    terms = tuple(map(Term.at, model.terms, [term.values for term in model.terms], np.split(sigmas, ends)))
+    names = np.array([f"{term.name}.{p.name}" for term in terms for p in term.parameters], object)
     covariance = kept_root @ kept_root.T
     covariance[np.ix_(fitted, fitted)] += of_fitted
     present = np.diag(covariance) > 0
-    names_present = tuple(name for name, is_present in zip(names, present, strict=True) if is_present)
-    of_effects = EffectsCovariance(names_present, covariance[np.ix_(present, present)])
-    if with_hand_eye is None or not any(term.is_geometry for term in terms):
-        return of_effects
-    cross_covariance = np.zeros((6, len(names)))
-    cross_covariance[:, fitted] = with_hand_eye[:, 6:]
-    return replace(of_effects, with_hand_eye=np.hstack([with_hand_eye[:, :6], cross_covariance[:, present]]))
+    of_effects = EffectsCovariance(tuple(names[present]), covariance[np.ix_(present, present)])
+    if any(term.is_geometry for term in terms):
+        cross_covariance = np.zeros((6, len(names)))
+        cross_covariance[:, fitted] = with_hand_eye[:, 6:]
+        known = np.hstack([with_hand_eye[:, :6], cross_covariance[:, present]])
+        of_effects = replace(of_effects, with_hand_eye=known)
+    return replace(model, terms=terms, effects_covariance=of_effects)
 
 
 def printed_covariance(T_mount: Array, covariance: Array) -> Array:

@@ -260,20 +260,6 @@ def fit_columns(columns: Array, values: Array) -> Array:
     return np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale
 
 
-def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
-    """Return x (k,) of matrix·x = −vector: of several, the smallest in units of unit diagonal (`equilibrated`).
-
-    Args:
-        matrix: (k, k) symmetric.
-        relative: directions with eigenvalues below this share of the largest have x = 0.
-    """
-    scaled, unit = equilibrated(matrix)
-    values, vectors = np.linalg.eigh(scaled)
-    keep = values > relative * values[-1]
-    projected = vectors[:, keep].T @ (-vector * unit) / values[keep]
-    return unit * (vectors[:, keep] @ projected)
-
-
 def symmetric_inverse(matrix: Array) -> Array:
     """Return the inverse (k, k) of a symmetric matrix of mixed units; zero in directions of almost no information."""
     return _pseudo_inverse(*equilibrated(matrix), relative=1e-10)

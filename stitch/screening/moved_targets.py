@@ -6,7 +6,7 @@ target to the others step between two views, or change little by little, and tho
 not, that one has moved; the fit would put it half way, and call the misfit of its views errors of the arm.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class MovedTarget:
     target: str
     start: int
     distance: float  # length_unit: by which its distances to the others change at the most
-    drifts: bool = False
+    drifts: bool
 
 
 def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
@@ -54,7 +54,8 @@ def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
         k = max(steps, key=lambda k: steps[k][0], default=-1)
         if k < 0 or steps[k][0] < LIMIT_TARGET:
             break
-        moved.append(replace(steps[k][1], target=sightings.targets[left.pop(k)]))
+        _, start, distance, drifts = steps[k]
+        moved.append(MovedTarget(sightings.targets[left.pop(k)], start, distance, drifts))
     return tuple(moved)
 
 
@@ -122,8 +123,10 @@ def _steps_of_means(off: Array) -> Array:
     return np.where(few, 0.0, np.sqrt(squares.sum(axis=1) / max(off.shape[1], 1)))
 
 
-def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
-    """Return by how many times the usual step the distances from target k change at view `start`, and the move.
+def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, int, float, bool]:
+    """Return by how many times the usual step the distances from target k change at view `start`, and what it did.
+
+    What it did: the view, by how much its distances change at the most, length_unit, and whether it drifts.
 
     Steps are differences of medians before and from that view on, in standard errors. The usual step is that of the
     distances among the other targets. If a straight line over the session fits clearly better, the target drifts.
@@ -137,7 +140,7 @@ def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float
     distances = _seen_on_both_sides(np.linalg.norm(places[:, partners] - places[:, k : k + 1], axis=2), start)
     others = _seen_on_both_sides(among, start)
     if not others.shape[1]:
-        return 0.0, MovedTarget("", start, 0.0)
+        return 0.0, start, 0.0, False
     # By the sensor's sigma, or by what is left on both sides: a lens changes distances too, but with every view.
     left = distances - _levels(distances, start)
     left_of_others = others - _levels(others, start)
@@ -148,7 +151,7 @@ def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float
     lines = _fitted_lines(distances)
     creeps = bool(np.nansum(np.abs(distances - lines)) < _DRIFT_SHARE * np.nansum(np.abs(left)))
     distance = np.max(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0)) if creeps else steps.max()
-    return float(np.median(times) / max(np.median(usual), 1.0)), MovedTarget("", start, float(distance), creeps)
+    return float(np.median(times) / max(np.median(usual), 1.0)), start, float(distance), creeps
 
 
 def _seen_on_both_sides(distances: Array, start: int) -> Array:

@@ -19,7 +19,7 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.numerics.least_squares import least_squares
+from stitch.numerics.least_squares import symmetric_inverse
 from stitch.numerics.reml import VarianceFit
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.run_data import effect_cure
@@ -412,7 +412,7 @@ def expected_poses(
     z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
     X = hstack_columns(model.hand_eye, model.columns(alone))
     CX = np.linalg.solve(model.mixed().covariance(tests.fit.variances)[0], X)
-    twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
+    twists = model.mount_twists @ (symmetric_inverse(X.T @ CX) @ (CX.T @ z))[:6]
     for step, by in zip(tests.steps, moved, strict=True):
         carried = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]
         twists[step.start :] += carried @ by

@@ -27,11 +27,11 @@ from stitch.model.model import (
     EffectsCovariance,
     Model,
     Term,
-    covariance_of_fit,
     expanded_uncertainty,
     kept_root,
     printed_covariance,
     term_of,
+    with_fitted_effects,
 )
 from stitch.model.model_toml import (
     ModelFile,
@@ -119,7 +119,8 @@ def test_parameters_of_another_run_are_kept_beside_those_that_are_fitted(term, m
     own = replace(own, parameters=tuple(replace(p, kept=p.name in ("d2", "d3", "d4")) for p in own.parameters))
     root = kept_root([own], covariance)
     fitted = np.array([False, False, False, False, True, False])
-    both = covariance_of_fit([own], fitted, np.array([[4e-10]]), root)
+    model = Model(np.eye(4), (own,))
+    both = with_fitted_effects(model, fitted, np.array([[4e-10]]), root, np.zeros((6, 7))).effects_covariance
     assert both.names == tuple(f"joint_offset.d{i}" for i in (2, 3, 4, 5))
     at = [both.names.index(f"joint_offset.{n}") for n in ("d4", "d2", "d3")]
     np.testing.assert_allclose(both.matrix[np.ix_(at, at)], matrix, rtol=1e-9, atol=1e-22)
