@@ -323,25 +323,29 @@ class _ViewInSlabs:
         self.lock = Lock()
 
     def voxels(self, slab: int) -> tuple[_Voxels, Unsupported]:
-        """Return the view's voxels of a slab, and how many of its points were left out without support.
+        """Return the view's voxels of a slab, and how many of its points were left out without support."""
+        return self._voxels_in_memory(slab) if self.whole is None else self._voxels_of_file(slab, self.whole)
 
-        Where memory holds the whole scan, its supported points are averaged by cell. Else the points of the file are
-        averaged by cell; each voxel takes normal, weight and support from the nearest point in memory. It is left out
-        too where it lies too far from that point, or too far off its tangent plane.
+    def _voxels_in_memory(self, slab: int) -> tuple[_Voxels, Unsupported]:
+        """Return the same where memory holds the whole scan: its supported points are averaged by cell."""
+        placed = _place_scan(self.scan, self.T, self.v)
+        inside = self.slabs.of(placed.points[:, self.slabs.axis]) == slab
+        alone = ~self.kept & ~self.through & inside
+        kept = placed.take(inside & self.kept)
+        voxels = _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), self.slabs.axis))
+        return voxels, Unsupported(int(inside.sum()), int(alone.sum()), int((self.through & inside).sum()))
+
+    def _voxels_of_file(self, slab: int, whole: WholeCloud) -> tuple[_Voxels, Unsupported]:
+        """Return the same of all points of the file, averaged by cell.
+
+        Each voxel takes normal, weight and support from the nearest point in memory. It is left out too where it lies
+        too far from that point, or too far off its tangent plane.
         """
-        axis = self.slabs.axis
-        if self.whole is None:
-            placed_scan = _place_scan(self.scan, self.T, self.v)
-            inside = self.slabs.of(placed_scan.points[:, axis]) == slab
-            alone = ~self.kept & ~self.through & inside
-            dropped = Unsupported(int(inside.sum()), int(alone.sum()), int((self.through & inside).sum()))
-            kept = placed_scan.take(inside & self.kept)
-            return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
-        in_memory, columns = self._points_in(slab, self.whole)
+        in_memory, columns = self._points_in(slab, whole)
         cells = self.slabs.cells(columns)
         if in_memory is None:
             return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
-        occupied, voxel_of_point = np.unique(pack_cells(cells, axis), return_inverse=True)
+        occupied, voxel_of_point = np.unique(pack_cells(cells, self.slabs.axis), return_inverse=True)
         count = np.bincount(voxel_of_point, minlength=len(occupied))
         mean = np.stack([np.bincount(voxel_of_point, x, len(occupied)) for x in columns], axis=1) / count[:, None]
         nearest = self._nearest(mean, count)

@@ -230,7 +230,7 @@ def pose_covariance(
         T_mount: (4, 4) maps scanner to mount.
         scatter: sigmas of the flange's poses, and the factor on the noise within overlaps.
     """
-    g, size = overlaps.gram, 6 * len(poses)
+    g = overlaps.gram
     variance = g.variance * scatter.noise_factor
     prior = prior_precision(capture, scatter, g.centre)
     K = with_free_mean(prior, hand_eye_jacobian(capture, T_mount, g.centre))
@@ -240,11 +240,27 @@ def pose_covariance(
     # Free offsets of views are unknowns too. They are eliminated: by `from_offsets` their gradient enters the twists'.
     free = [v for v, scan in enumerate(capture.scans) if method.offsets and (scan.stock or v in equations.offsets)]
     sums = OffsetSums(g, overlaps.matches, weights, capture)
-    from_offsets = np.linalg.solve(sums.matrix[np.ix_(free, free)], sums.coupling.reshape(size, -1)[:, free].T)
-    # Per view, the gradient by each of its points: by the twists of all views, then by the free offsets.
+    coupling = sums.coupling.reshape(len(K), -1)[:, free]
+    from_offsets = np.linalg.solve(sums.matrix[np.ix_(free, free)], coupling.T)
+    elimination = np.hstack([np.eye(len(K)), -from_offsets.T])
+    M = elimination @ _gradient_covariance(capture, overlaps, [w / variance for w in weights], free) @ elimination.T
+    return inverse @ (M + K) @ inverse
+
+
+def _gradient_covariance(capture: Capture, overlaps: Overlaps, weights: Sequence[Array], free: Sequence[int]) -> Array:
+    """Return the covariance (6V + F, 6V + F) of the gradient by twists of V views and offsets of F of them.
+
+    It is Σ σ² gᵀg over the points of all scans, with g a point's part of the gradient and σ the noise of its scan.
+
+    Args:
+        weights: (M,) per match, over the variance of a distance.
+        free: numbers of the F views.
+    """
+    g, size = overlaps.gram, 6 * len(capture.scans)
     gradients = [csr_array((len(scan.points), size + len(free))) for scan in capture.scans]
     for m, weight in zip(overlaps.matches, weights, strict=True):
         rows = frames.plane_rows(m.middle - g.centre, m.normal)
+        # Change of each distance by all twists and offsets: its second view acts against its first.
         by_distance = np.zeros((len(rows), size + len(free)))
         sides = ((m.v, m.index_v, 1.0), (m.w, m.index_w, -1.0))
         for v, index, sign in sides:
@@ -252,15 +268,11 @@ def pose_covariance(
             if v in free:
                 by_distance[:, size + free.index(v)] = sign * acts(capture, v, index)
         for v, index, sign in sides:
-            at = index, np.arange(len(index))
-            to_points = csr_array((sign * weight / variance, at), (len(capture.scans[v].points), len(index)))
+            shape = len(capture.scans[v].points), len(index)
+            to_points = csr_array((sign * weight, (index, np.arange(len(index)))), shape)
             gradients[v] = gradients[v] + to_points @ csr_array(by_distance)
     noises = [scan.noise if np.isfinite(scan.noise) else np.sqrt(g.variance / 2) for scan in capture.scans]
-    scatter_of_gradient = sum(
-        noise**2 * (gradient.T @ gradient).toarray() for noise, gradient in zip(noises, gradients, strict=True)
-    )
-    elimination = np.hstack([np.eye(size), -from_offsets.T])
-    return inverse @ (elimination @ scatter_of_gradient @ elimination.T + K) @ inverse
+    return sum(s**2 * (gradient.T @ gradient).toarray() for s, gradient in zip(noises, gradients, strict=True))
 
 
 class _Progress:

@@ -92,24 +92,27 @@ class CommonCovariance:
     def weights(self, variances: Array) -> PairWeights:
         """Return the weights of all pairs at variances λ (c,), the sensor's noise last.
 
-        Where V has no inverse its `logdet` is infinite, and the rest means nothing.
+        A group of n blocks has W = (Σ λ_i C_i)⁻¹ (r, r) and, per component, the share W C_i. Its part of log det V is
+        n log det W⁻¹, of tr(V⁻¹C_i) n tr(W C_i), of tr(V⁻¹C_iV⁻¹C_j) n tr(W C_i W C_j); ∂W/∂λ_i = −W C_i W. In all
+        other directions V is the noise's variance λ. Where V has no inverse `logdet` is infinite, and the rest means
+        nothing.
         """
-        noise = variances[-1]
-        count = len(variances)
+        noise, count = variances[-1], len(variances)
         logdet = self.logdet + self.noise_alone * float(np.log(noise))
         pairs, slopes = list[Array](), list[Array]()
         traces, curvature = np.zeros(count), np.zeros((count, count))
         for group in self.groups:
             inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
             W, n = inverse.matrix[0], len(group.blocks)
-            # Pairs i ≤ j, row after row, in the order of `pair_products`; `shares` are V⁻¹C_i, (c, r, r).
-            upper = np.triu_indices(len(W))
             shares = W @ group.components
             logdet += n * inverse.logdet
+            # Pairs i ≤ j, row after row, in the order of `pair_products`.
+            upper = np.triu_indices(len(W))
             pairs.append(W[upper])
             slopes.append((shares @ W)[:, *upper])
             traces += n * shares.trace(axis1=1, axis2=2)
             curvature += n * shares.reshape(count, -1) @ shares.transpose(0, 2, 1).reshape(count, -1).T
+        # The last two pairs: noise alone, of which only the last component has some, and numbers of known variance.
         of_noise = np.arange(count) == count - 1
         traces[-1] += self.noise_alone / noise
         curvature[-1, -1] += self.noise_alone / noise**2

@@ -414,23 +414,30 @@ class LinearModel:
 
     @cached_property
     def _sums_of_twists(self) -> tuple[Array, Array, float, Array]:
-        """Return D (V, 6, 6), F (V, r, 6), a sign s and q (V, 6): products of unit twists of the views.
+        """Return D (V, 6, 6), F (V, r, 6), a sign s and q (V, 6): sums over all numbers of unit twists of the views.
 
-        With the 6 whitened unit twists of view v as columns U_v, the model's columns projected out, the information of
-        two views is U_vᵀU_w = δ_vw D_v + s F_vᵀF_w. q_v is U_vᵀ times the whitened residual.
+        Let U_v (n, 6) be the whitened unit twists of view v, what the model's columns explain taken off. Then
+        U_vᵀU_w = δ_vw D_v + s F_vᵀF_w for any two views, and q_v is U_vᵀ times the whitened residual. Two cases:
+
+        - Views share numbers, as of surfaces: F_v is U_v itself, r = n, s = 1, and D is zero.
+        - Each view has numbers of its own: with T_v (numbers, 6) its whitened unit twists and E_v its rows of the
+          orthonormal basis E (n, r) of what the model explains, D_v = T_vᵀT_v, F_v = E_vᵀT_v and s = −1.
         """
-        views, rows = self.measurement.views.count, self.observation.numbers_per_view
-        # Where views share numbers, U_v has all n rows and is F_v itself. Else D_v is of the rows of the view alone;
-        # F subtracts what the model explains, by its orthonormal basis of r columns.
-        if rows is None:
+        views, numbers = self.measurement.views.count, self.observation.numbers_per_view
+        if numbers is None:
             unit = self.residual(self.observation.from_twists(np.eye(6 * views)))
             shared = unit.reshape(-1, views, 6).transpose(1, 0, 2)
             return np.zeros((views, 6, 6)), shared, 1.0, (unit.T @ self.white_residual).reshape(views, 6)
-        unit = self.whiten(self.observation.from_twists(np.tile(np.eye(6), (views, 1)))).reshape(-1, rows, 6)[:views]
-        transposed = unit.transpose(0, 2, 1)
-        shared = (transposed @ self._explained.reshape(-1, rows, self._explained.shape[1])[:views]).transpose(0, 2, 1)
-        pulls = (transposed @ self.white_residual.reshape(-1, rows, 1)[:views])[..., 0]
-        return transposed @ unit, shared, -1.0, pulls
+        unit = self.whiten(self.observation.from_twists(np.tile(np.eye(6), (views, 1))))
+
+        def of_views(rows: Array) -> Array:
+            """Return the rows (n, k) of the views' own numbers as (V, numbers, k)."""
+            return rows.reshape(-1, numbers, rows.shape[-1])[:views]
+
+        transposed = of_views(unit).transpose(0, 2, 1)
+        shared = (transposed @ of_views(self._explained)).transpose(0, 2, 1)
+        pulls = (transposed @ of_views(self.white_residual[:, None]))[..., 0]
+        return transposed @ of_views(unit), shared, -1.0, pulls
 
     @cached_property
     def _own_information(self) -> ModelInformation:

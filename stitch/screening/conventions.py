@@ -249,23 +249,24 @@ def _on_linear_axis(
 def _between_rows(stated: Hypothesis, motions: RelativeScans, length: float) -> Iterator[Hypothesis]:
     """Yield the poses at the scans, if each pose stated lies midway between those of its scan and of a neighbour's.
 
-    Two ways of interpolation are undone. As screws: the scanner's motions are halved, the hand-eye that explains the
-    stated poses by these is fitted, and each pose is moved back by half a motion. Along lines: rotations as before,
-    positions found from the motions.
+    Let B_v be the scanner's motion from row v to the next, by the scans, and h_v half of the one to the neighbour, as
+    a twist. Between the places that the stated poses mean, the scanner moves by exp(−h_v) · B_v · exp(h_w), with
+    w = v + 1. The hand-eye X that explains the stated poses by these motions makes the pose at scan v the stated one
+    times X · exp(−h_v) · X⁻¹, if poses were interpolated as screws. If along lines, rotations are the same, and
+    positions are found from the motions.
 
     Args:
         length: what a motion may leave open, length_unit.
     """
-    steps = {v: frames.log(motions.T[i]) for i, (v, w) in enumerate(motions.pairs) if w == v + 1}
+    to_next = {v: frames.log(motions.T[i]) for i, (v, w) in enumerate(motions.pairs) if w == v + 1}
     count = len(stated.T_base_flange)
     for ahead, where, neighbour in ((1, "after", "next"), (-1, "before", "previous")):
-        # Half the motion from a row to its neighbour.
-        half = {v: 0.5 * ahead * steps[min(v, v + ahead)] for v in range(count) if min(v, v + ahead) in steps}
-        pairs = tuple((v, v + 1) for v in half if v + 1 in half and v in steps)
+        half = {v: 0.5 * ahead * to_next[min(v, v + ahead)] for v in range(count) if min(v, v + ahead) in to_next}
+        pairs = tuple((v, v + 1) for v in half if v + 1 in half and v in to_next)
         if len(pairs) < FEWEST:
             continue
-        between = np.array([frames.exp(-half[v]) @ frames.exp(steps[v]) @ frames.exp(half[w]) for v, w in pairs])
-        X = fit_motions(stated, RelativeScans(pairs, between), length).T_mount
+        of_stated = [frames.exp(-half[v]) @ frames.exp(to_next[v]) @ frames.exp(half[w]) for v, w in pairs]
+        X = fit_motions(stated, RelativeScans(pairs, np.array(of_stated)), length).T_mount
         used = tuple(sorted(half))
         T = np.array(stated.T_reference_mount)
         for v in used:
@@ -337,8 +338,8 @@ def _positions_of_middles(middle: Array, ahead: int) -> tuple[Array, Array]:
 def _by_table_part(tried: Sequence[Hypothesis], motions: RelativeScans, names: Sequence[str]) -> Iterator[Hypothesis]:
     """Yield the stated poses with a mistake of rotations undone only in a part of the table: its beginning or its end.
 
-    For each mistake, the parts under which most motions turn by the scanner's angle, if that is more than all rows or
-    none.
+    For each mistake, the parts under which most motions turn by the scanner's angle, if these are more than under all
+    rows or none. Under any hand-eye mount and scanner turn by the same angle (Chen 1991), so that this needs none.
 
     Args:
         tried: hypotheses, the first of which is the poses as stated.
@@ -346,25 +347,27 @@ def _by_table_part(tried: Sequence[Hypothesis], motions: RelativeScans, names: S
     """
     count = len(names)
     v, w = np.array(motions.pairs).T
-    sides = [side for k in range(1, count) for side in (np.arange(count) < k, np.arange(count) >= k)]
-    sides = [side for side in sides if min((side[v] & side[w]).sum(), (~side[v] & ~side[w]).sum()) >= FEWEST]
+    # Masks (V,) of the rows up to each place in the table, and from there on, with motions inside and outside of them.
+    parts = [part for k in range(1, count) for part in (np.arange(count) < k, np.arange(count) >= k)]
+    parts = [part for part in parts if min((part[v] & part[w]).sum(), (~part[v] & ~part[w]).sum()) >= FEWEST]
     stated = tried[0]
-    angles = frames.angle_between(np.eye(4), motions.T)
+    scanner_angles = frames.angle_between(np.eye(4), motions.T)
     for h in tried[1:]:
-        if h.kind not in _OF_ONE_ROW or not sides:
+        if h.kind not in _OF_ONE_ROW or not parts:
             continue
         R = np.array([stated.T_reference_mount[:, :3, :3], h.T_reference_mount[:, :3, :3]])
         if np.abs(R[1] - R[0]).max() < ROTATION:
             continue
-        # Motions that turn as far as the scanner did, by how their first and their second row are read.
+        # agrees[a, b, m]: motion m turns as far as the scanner, its first row read as stated (a = 0) or with the
+        # mistake undone (1), its second row likewise (b).
         cosine = (np.einsum("amij,bmij->abm", R[:, v], R[:, w]) - 1) / 2
-        near = np.abs(np.arccos(np.clip(cosine, -1, 1)) - angles) < ROTATION
-        agree = [near[side[v].astype(int), side[w].astype(int), np.arange(len(v))].mean() for side in sides]
-        if max(agree) <= max(near[0, 0].mean(), near[1, 1].mean()):
+        agrees = np.abs(np.arccos(np.clip(cosine, -1, 1)) - scanner_angles) < ROTATION
+        shares = [agrees[part[v].astype(int), part[w].astype(int), np.arange(len(v))].mean() for part in parts]
+        if max(shares) <= max(agrees[0, 0].mean(), agrees[1, 1].mean()):
             continue
         # Several parts may agree with as many angles: which one is right only the hand-eye shows, later.
-        for side in (side for side, share in zip(sides, agree, strict=True) if share == max(agree)):
-            rows = tuple(int(row) for row in np.flatnonzero(side))
-            T = np.where(side[:, None, None], h.T_base_flange, stated.T_base_flange)
+        for part in (part for part, share in zip(parts, shares, strict=True) if share == max(shares)):
+            rows = tuple(np.flatnonzero(part).tolist())
+            T = np.where(part[:, None, None], h.T_base_flange, stated.T_base_flange)
             fix = sentence("part of the table", first=names[rows[0]], last=names[rows[-1]], fix=h.fix)
             yield replace(h, T_base_flange=T, fix=fix, rows=rows)

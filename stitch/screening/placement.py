@@ -264,22 +264,53 @@ def place_unlinked_views(
     """
     if not linked.unlinked or len(linked.core) < 2:
         return {}, list(linked.unlinked), set()
-    size = part_size([capture])
+    placed = place_groups(capture, unconstrained.poses, linked, tolerance, needed)
+    alone = [v for v in linked.unlinked if v not in placed]
     poses = np.array(unconstrained.poses)
-    placed = place_groups(capture, poses, linked, tolerance, needed)
     for v, placement in placed.items():
         poses[v] = placement.T
-    alone = [v for v in linked.unlinked if v not in placed]
-    waiting = alone
     core = [*linked.core, *placed]
-    several = set[int]()
+    singles, several = _place_singles(capture, model_poses, poses, core, alone, tolerance, needed)
+    # The views of a group share their displacement. If the group fits nowhere, a single view that fits somewhere, and
+    # not at a row's pose, does so only because the part looks alike there.
+    in_groups = {v for group in linked.components[1:] if len(group) > 1 for v in group}
+    near = CLOSE_SHARE * part_size([capture])
+    unsure = {
+        v
+        for v, placement in singles.items()
+        if v in in_groups and _distance_from_rows(capture.scans[v], placement, model_poses) > near
+    }
+    placed |= {v: placement for v, placement in singles.items() if v not in unsure}
+    return placed, [v for v in alone if v not in placed], several
+
+
+def _place_singles(
+    capture: Capture,
+    model_poses: Array,
+    poses: Array,
+    core: Sequence[int],
+    alone: Sequence[int],
+    tolerance: float,
+    needed: float,
+) -> tuple[dict[int, Placement], set[int]]:
+    """Return the placements of single views on the surface of others, and the views that fit several places alike.
+
+    In rounds: those placed join the others, and the rest is tried again, until none is placed.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        poses: (V, 4, 4) T_reference_scanner of the views whose surface counts at first; others are not read.
+        core: numbers of these views.
+        alone: numbers of the views to place.
+        tolerance: distance along the normal at which a point lies on the surface, length_unit.
+        needed: closure from which a scan counts as placed.
+    """
+    poses, core, waiting = poses.copy(), list(core), list(alone)
+    placed, several = dict[int, Placement](), set[int]()
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
-        fits = {
-            v: _place_alone(capture, model_poses, v, surface, needed)
-            for v in waiting
-            if not shows_no_surface(capture.scans[v])
-        }
+        shown = [v for v in waiting if not shows_no_surface(capture.scans[v])]
+        fits = {v: _place_alone(capture, model_poses, v, surface, needed) for v in shown}
         several = {v for v, (best, has_rivals) in fits.items() if best is not None and has_rivals}
         new = {v: best for v, (best, has_rivals) in fits.items() if best is not None and not has_rivals}
         if not new:
@@ -289,15 +320,7 @@ def place_unlinked_views(
         placed |= new
         core += list(new)
         waiting = [v for v in waiting if v not in new]
-    # The views of a group share their displacement. If the group fits nowhere, a single view that fits somewhere, and
-    # not at a row's pose, does so only because the part looks alike there.
-    in_groups = {v for group in linked.components[1:] if len(group) > 1 for v in group}
-    unsure = {
-        v
-        for v in in_groups & set(alone) & set(placed)
-        if _distance_from_rows(capture.scans[v], placed[v], model_poses) > CLOSE_SHARE * size
-    }
-    return {v: at for v, at in placed.items() if v not in unsure}, sorted([*waiting, *unsure]), several
+    return placed, several
 
 
 def _place_alone(
