@@ -126,13 +126,14 @@ def reduction_of(
     (V, m, _), U = lever.shape, unknowns.shape[2]
     variance = noise + known
     per_sigma = np.where(variance > 0, variance, np.inf) ** -0.5
+    # Step 1.
     of_views = pose_numbers(per_sigma[:V, :, None] * lever)
+    pose_rows = by_view(of_views)
+    # Step 2, with each landmark in units of its effect on all rows.
     points = csr_array(unknowns.reshape(-1, U)).multiply(per_sigma.reshape(-1, 1)).tocsr()
+    in_views = points[: V * m]
     length = np.sqrt(points.multiply(points).sum(axis=0))
     per_length = np.where(length > 0, length, np.inf) ** -1
-    pose_rows = by_view(of_views)
-    in_views = points[: V * m]
-    # What landmarks change of poses and of known rows; combinations that change nothing there are eliminated.
     shown = np.vstack([(pose_rows @ in_views).toarray(), points[V * m :].toarray()]) * per_length
     _, sizes, directions = np.linalg.svd(np.linalg.qr(shown, mode="r"))
     rank = int((sizes > _ROUNDING * sizes.max(initial=1e-300)).sum())
@@ -145,8 +146,10 @@ def reduction_of(
         white = white - pose_rows.T @ (pose_rows @ white)
         return white - in_views @ (eliminated @ (inverse @ (eliminated.T @ (in_views.T @ white))))
 
+    # Step 3.
     others = np.hstack([in_views @ kept, flatten_blocks((per_sigma[..., None] * of_points)[:V])])
     beyond = _row_space(rest(others), others)
+    # Step 4: a number of every row that the sensor's noise has, less those that one of the first three took.
     noise_rows = rest((per_sigma * residual)[:V].reshape(-1, 1))[:, 0]
     noise_rows = noise_rows - beyond.T @ (beyond @ noise_rows)
     placed = np.linalg.matrix_rank(information, hermitian=True) if eliminated.size else 0
