@@ -17,7 +17,7 @@ from stitch.api.session import Session, public_session
 from stitch.errors import InputError
 from stitch.model.model import COVERAGE_FACTOR, displacement
 from stitch.numerics.frames import Array
-from stitch.numerics.units import METRES
+from stitch.numerics.units import MILLIMETRES
 from stitch.output import run_folder
 from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.fit_report import fit_report
@@ -86,7 +86,7 @@ class FittedHandEye(Value):
     @property
     def U(self) -> AtPart:
         """U (k = 2) in mm and mrad at the part, for a complete model: over all directions, one number each."""
-        mm = 1e3 * METRES[self.length_unit]
+        mm = MILLIMETRES[self.length_unit]
         turn = COVERAGE_FACTOR * float(np.sqrt(np.trace(self.covariance[:3, :3])))
         return AtPart(displacement(self.covariance, self.middle) * mm, 1e3 * turn)
 

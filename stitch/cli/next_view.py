@@ -92,7 +92,7 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
     import numpy as np
 
     from stitch.diagnosis.next_view import deciding_words
-    from stitch.numerics.units import METRES
+    from stitch.numerics.units import MILLIMETRES
     from stitch.system.files import whole_file
 
     poses = proposed_poses(diagnosis)
@@ -103,7 +103,7 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
         raise InputError(f"{output}: programs are written by stitch's export plug-in; to fix: install stitch anew")
     # Programs are in mm.
     T_base_flange = np.array([proposal.T_base_flange for proposal in poses])
-    T_base_flange[:, :3, 3] *= METRES[diagnosis.linear.measurement.length_unit] * 1e3
+    T_base_flange[:, :3, 3] *= MILLIMETRES[diagnosis.linear.measurement.length_unit]
     about = (
         f"Drives to the view that decides {deciding_words(diagnosis)}." if poses[0].separates else "Drives to a view."
     )

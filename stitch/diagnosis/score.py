@@ -29,7 +29,7 @@ from stitch.numerics.frames import Array, Mask
 from stitch.numerics.least_squares import column_space
 from stitch.numerics.parameter_selection import log_evidence_at_scales, log_mixture
 from stitch.numerics.reml import NOISE, USUAL_NOISE_FACTOR, FurtherColumns, at_variances, fit_variances
-from stitch.numerics.units import METRES
+from stitch.numerics.units import MILLIMETRES
 from stitch.numerics.variance_posterior import satterthwaite
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import USUAL_JOINT_SCATTER, usual_twist
@@ -322,7 +322,7 @@ class ScatterLimit:
 def scatter_limit(session: SessionData) -> ScatterLimit:
     """Return the repeatability that the session states under [robot]; else the scatter that no sound arm exceeds."""
     stated, (rotation, translation) = session.repeatability, limits.IMPLAUSIBLE
-    usual = translation * METRES["mm"] / METRES[session.length_unit]
+    usual = translation / MILLIMETRES[session.length_unit]
     return ScatterLimit(
         rotation=rotation if stated.sigma_rotation is None else stated.sigma_rotation,
         translation=usual if stated.sigma_translation is None else stated.sigma_translation,

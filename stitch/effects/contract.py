@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from stitch.errors import InputError, did_you_mean
-from stitch.numerics.units import Amount, format_amount
+from stitch.numerics.units import MILLIMETRES, Amount, format_amount, length_power
 from stitch.session.axes import KINDS, Axis
 from stitch.session.measurement import TEMPERATURES, Measurement, Views
 
@@ -37,8 +37,6 @@ PLACES = {
     "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
 }
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
-# Units are written for millimetres; a session in metres has the same unit with m.
-_PER_MM = {"mm": 1.0, "m": 1e-3}
 # What a link and all that it carries may well weigh, kg, where nobody states it; and how much more than is
 # believable for a known mass the product of mass and compliance may be, for light and soft arms too.
 _LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
@@ -334,8 +332,8 @@ def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
     if spec.kind in ("torque", "moment") and "_" in name[len(key) :].lstrip("_"):
         # A torque between two joints, or a moment of one link, is that of 1 kg there: the coefficient holds its mass.
         unit, typical, limit = f"kg {unit}", _LINK_MASS * typical, _LINK_MASS_LIMIT * limit
-    numerator, _, denominator = unit.partition("/")
-    factor = _PER_MM[length_unit] ** ((numerator == "mm") - (denominator == "mm"))
+    # Units are written for millimetres; a session in metres has the same unit with m.
+    factor = MILLIMETRES[length_unit] ** -length_power(unit, "mm")
     return Parameter(name, unit.replace("mm", length_unit), typical * factor, limit * factor, spec.grid, argument=key)
 
 

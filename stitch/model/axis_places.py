@@ -14,7 +14,7 @@ from stitch.model.forward import true_chain
 from stitch.model.model import Model, Term, values_of
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.numerics.units import METRES, value_uncertainty_text
+from stitch.numerics.units import MILLIMETRES, value_uncertainty_text
 from stitch.session.axes import Axis
 from stitch.session.measurement import Measurement
 from stitch.system.values import Value
@@ -47,7 +47,7 @@ class AxisPlace(Value):
             >>> [axis.line("mm") for axis in run.axes]
             []
         """
-        to_mm = METRES[length_unit] * 1e3
+        to_mm = MILLIMETRES[length_unit]
         numbers = zip(self.direction, 2 * self.direction_sigma, strict=True)
         shown = bool(np.isfinite(self.direction_sigma).all())
         text = ", ".join(value_uncertainty_text(x, u) if shown else f"{x:.6f}" for x, u in numbers)

@@ -20,7 +20,7 @@ from stitch.effects.contract import Effect, Parameter, find_effect, parameters_i
 from stitch.numerics import frames
 from stitch.numerics.distributions import sigmas_among
 from stitch.numerics.frames import Array, Mask
-from stitch.numerics.units import METRES, value_uncertainty_text
+from stitch.numerics.units import MILLIMETRES, value_uncertainty_text
 from stitch.session.measurement import Measurement
 from stitch.system.values import Value
 
@@ -355,7 +355,7 @@ def hand_eye_lines(
         stated: session.toml states the hand-eye, whose unknown numbers are then printed; else "not known".
     """
     frame = "base" if mount == "eye_to_hand" else "flange"
-    to_mm = METRES[length_unit] * 1e3
+    to_mm = MILLIMETRES[length_unit]
     rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
     U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
 

@@ -19,7 +19,7 @@ from stitch.errors import InputError
 from stitch.model.model import ARM_PLACES, EffectsCovariance, Model, Target, Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, is_rigid
-from stitch.numerics.units import METRES
+from stitch.numerics.units import METRES, length_power
 from stitch.session.axis_poses import place_axes
 from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
@@ -407,7 +407,7 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
         T[:3, 3] *= factor
     known = file.effects_covariance
     units = {f"{name}.{key}": p.unit for name, parameters in file.effects.items() for key, p in parameters.items()}
-    factors = np.array([factor ** _power(units.get(name, ""), file.length_unit) for name in known.names])
+    factors = np.array([factor ** length_power(units.get(name, ""), file.length_unit) for name in known.names])
     beside = np.append(scale, factors)
     return replace(
         file,
@@ -434,12 +434,6 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
 
 def _rescaled(p: Parameter, old: str, new: str, factor: float) -> Parameter:
     """Return a parameter with its lengths in unit `new` instead of `old`; `factor` is one `old` in units `new`."""
-    power = _power(p.unit, old)
+    power = length_power(p.unit, old)
     unit = "/".join(new if part.strip() == old else part for part in p.unit.split("/"))
     return replace(p, unit=unit, value=p.value * factor**power, sigma=p.sigma * factor**power)
-
-
-def _power(unit: str, length: str) -> int:
-    """Return the power of lengths in a unit, where `length` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
-    above, _, below = unit.partition("/")
-    return (above.strip() == length) - (below.strip() == length)

@@ -7,7 +7,14 @@ import numpy as np
 
 METRES = {"mm": 1e-3, "m": 1.0}  # in one length_unit
 CLOUD_METRES = METRES | {"cm": 1e-2, "inch": 0.0254}  # in one unit of the files of clouds
+MILLIMETRES = {"mm": 1.0, "m": 1e3}  # in one length_unit
 MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
+
+
+def length_power(unit: str, length: str) -> int:
+    """Return the power of lengths in a unit, where `length` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
+    above, _, below = unit.partition("/")
+    return (above.strip() == length) - (below.strip() == length)
 
 
 def length_text(value: float, length_unit: str, digits: int = 3, zeros: bool = False) -> str:

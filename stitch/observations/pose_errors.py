@@ -38,6 +38,7 @@ from stitch.numerics.kernels import (
     two_joint_kernel,
 )
 from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+from stitch.numerics.units import MILLIMETRES
 from stitch.session.measurement import Measurement
 from stitch.session.torques import STILL
 
@@ -52,9 +53,8 @@ _ARM_COVARIATES = ("joints", "torque")
 # bending and all that is smooth might do, this share of σ is usual beside it, between the tenth and its root.
 _BESIDE_GEOMETRY = 0.25
 EFFECT_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
-# Usual σ of what wanders and of stops, rad and mm along each axis of the flange; length_unit per mm.
+# Usual σ of what wanders and of stops, rad and mm along each axis of the flange.
 _ROTATION, _TRANSLATION = 2e-5, 0.02
-_PER_MM = {"mm": 1.0, "m": 1e-3}
 # What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
 # a usual session. Each has a size of its own: how much neighbours differ says how large it is, its memory what of it
 # all views share; with both in one size that was understated.
@@ -129,7 +129,7 @@ def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -
 
 def usual_twist(length_unit: str) -> Array:
     """Return how much a flange usually turns and moves in one view, (6,): rad before length_unit."""
-    return np.repeat([_ROTATION, _TRANSLATION * _PER_MM[length_unit]], 3)
+    return np.repeat([_ROTATION, _TRANSLATION / MILLIMETRES[length_unit]], 3)
 
 
 def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:

@@ -16,7 +16,7 @@ from pykdtree.kdtree import KDTree
 from scipy.sparse import csr_matrix
 
 from stitch.numerics.frames import Array, Indices, Mask
-from stitch.numerics.units import METRES
+from stitch.numerics.units import MILLIMETRES
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import RMS_GATE
 from stitch.session.session import SessionData
@@ -84,7 +84,7 @@ def full_colour_distance(field: DisagreementField, session: SessionData) -> floa
     is no noise, and `_PALE` times the scatter of a usual or stated arm, which is so drawn pale.
     """
     stated = session.repeatability.sigma_translation
-    usual = _USUAL_ARM / (METRES[session.length_unit] * 1e3) if stated is None else stated
+    usual = _USUAL_ARM / MILLIMETRES[session.length_unit] if stated is None else stated
     return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma), _PALE * usual)
 
 
