@@ -1,11 +1,7 @@
-"""The panel cell in closed loop on any machines that drive and measure: pose first, then shape; and its tables.
+"""The panel cell in closed loop: `stitch panel` solves each step, a simulated cell drives and measures."""
 
-`stitch panel` gives the commands of one step from files; a loop drives, measures and steps again.
-"""
-
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,26 +11,18 @@ from data_synth.cells.panel import NAMES, PanelCell, Sizes
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.plugins.cells.panel import PanelJob, PanelPoints, calibrate_robots, solve_panel_job
 from stitch.plugins.cells.panel_model import (
     SHAPE_AXES,
     ClampLayout,
-    ControlPoints,
     LaserTracker,
     Legs,
     ReflectorReadings,
-    RigidFit,
     RobotModel,
-    adjust_pose,
     calibrate_robot,
-    clamp_contacts,
     errors_along_motion,
-    find_leg_offset,
     follow,
-    largest_deviations,
-    preposition,
     rigid_fit,
-    shape_step,
-    true_flanges,
 )
 
 LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
@@ -60,124 +48,54 @@ DRIFT_CELLS = 20
 _MOST_CORRECTIONS = 10
 
 
-class PanelMachines(Protocol):
-    """What a loop needs of the machines."""
-
-    def drive(self, T_base_flange: Array, /) -> None:
-        """All robots to poses (N, 4, 4)."""
-
-    def track(self, nominal: Array, /) -> Array:
-        """Readings (K, 3), world frame, of the panel's targets given by their nominal places (K, 3)."""
-
-    def forces(self) -> Array:
-        """(N, 6) change of torques and forces at the clamps since the panel was laid on."""
+def calibrated(seed: int, **settings) -> tuple[PanelCell, PanelJob]:
+    """Return a cell whose clamps wait for the panel, and its job: what was calibrated, and where the robots stand."""
+    cell = PanelCell(seed, **settings)
+    job = measured_job(cell)
+    job = replace(job, flanges=solve_panel_job(job).preposition)
+    cell.drive(job.flanges)
+    return cell, job
 
 
-@dataclass(frozen=True)
-class PanelSetup:
-    """Where the panel shall go, and what holds it."""
-
-    models: Sequence[RobotModel]
-    master: int
-    tracker: LaserTracker
-    T_world_target: Array  # (4, 4)
-
-
-@dataclass(frozen=True)
-class ShapeRun:
-    """Deviations and forces, first before any correction."""
-
-    T_base_flange: Array  # (N, 4, 4) at the end
-    deviations: list[Array]  # (N,) mm each
-    forces: list[Array]  # (N, 6) each
+def measured_job(cell: PanelCell, legs: Legs | None = None) -> PanelJob:
+    """Return the job of a cell with what the tracker sees of all reflectors at the poses of the calibration."""
+    commands = panel_job.calibration_poses(POSES, cell.seed)
+    places = panel_job.calibration(cell, commands)
+    tracker = LaserTracker(cell.tracker)
+    sigma = tracker.sigma(places)
+    readings = tuple(ReflectorReadings(n, commands[:, i], places[:, i], sigma[:, i]) for i, n in enumerate(NAMES))
+    stated = (NAMES, MASTER, cell.target, LAYOUT, tracker, TOLERANCE, SHAPE_AXES, legs)
+    return PanelJob(*stated, readings, flanges=None, targets=None, control=None, forces=None)
 
 
-def measure_pose(cell: PanelMachines, setup: PanelSetup, targets: Array) -> RigidFit:
-    """The panel's pose from its targets (K, 3), panel frame."""
-    places = cell.track(targets)
-    return rigid_fit(targets, places, setup.tracker.sigma(places))
-
-
-def run_pose(cell: PanelMachines, setup: PanelSetup, targets: Array, T_base_flange: Array) -> Array:
-    """One adjustment: measure, move master and slaves; returns where the robots stand then, (N, 4, 4)."""
-    bases = np.array([m.T_world_base for m in setup.models])
-    T_world_panel = measure_pose(cell, setup, targets).T
-    moved = adjust_pose(bases, T_base_flange, setup.master, T_world_panel, setup.T_world_target)
+def adjust_panel(cell: PanelCell, job: PanelJob) -> PanelJob:
+    """Measure the panel's pose and move it to its target; return the job with where the robots stand then."""
+    nominal = panel_job.pose_targets()
+    targets = PanelPoints([], nominal, cell.track(nominal), np.full(len(nominal), -1))
+    moved = solve_panel_job(replace(job, targets=targets)).pose_commands
     cell.drive(moved)
-    return moved
+    return replace(job, flanges=moved)
 
 
-def run_shape(
-    cell: PanelMachines,
-    setup: PanelSetup,
-    control: ControlPoints,
-    T_base_flange: Array,
-    *,
-    tolerance: float,
-    axes: Array = SHAPE_AXES,
-) -> ShapeRun:
-    """Correct from poses (N, 4, 4) on until all control points are within the tolerance, mm.
+def correct_shape(cell: PanelCell, job: PanelJob) -> tuple[list[Array], list[Array]]:
+    """Return deviations (N,), mm, and forces (N, 6), before each correction and when all points are within tolerance.
 
     Raises:
         NoResultError: they are not after ten corrections.
     """
-    contact = np.array([m.T_flange_contact for m in setup.models])
+    nominal, clamp = panel_job.control_points()
     deviations: list[Array] = []
     forces: list[Array] = []
-    T_target_world = frames.inverse(setup.T_world_target)
     for _ in range(_MOST_CORRECTIONS + 1):
-        places = frames.transform(T_target_world, cell.track(control.nominal))
-        step = shape_step(places, control, T_base_flange, contact, axes=axes)
-        deviations.append(largest_deviations(step.deviations, control))
+        control = PanelPoints([], nominal, cell.track(nominal), clamp)
+        result = solve_panel_job(replace(job, control=control))
+        deviations.append(result.shape_largest)
         forces.append(cell.forces())
-        if deviations[-1].max() <= tolerance:
-            return ShapeRun(T_base_flange, deviations, forces)
-        T_base_flange = step.T_base_flange
-        cell.drive(T_base_flange)
-    raise NoResultError(
-        f"shape: still {deviations[-1].max():.2f} mm off after {_MOST_CORRECTIONS} corrections "
-        f"(tolerance {tolerance:g} mm); look at the forces, or check that control points and clamps belong together"
-    )
-
-
-@dataclass
-class Ready:
-    """A cell with its panel on the clamps."""
-
-    cell: PanelCell
-    setup: PanelSetup
-    readings: list[ReflectorReadings]
-    T_base_flange: np.ndarray
-
-
-def ready(seed: int, **settings) -> Ready:
-    """Calibrate, pre-position, lay the panel on."""
-    r = ready_without_panel(seed, **settings)
-    r.cell.lay()
-    return r
-
-
-def ready_without_panel(seed: int, **settings) -> Ready:
-    """Calibrate and pre-position."""
-    cell = PanelCell(seed, **settings)
-    tracker = LaserTracker(cell.tracker)
-    readings = read(cell, tracker)
-    setup = PanelSetup([calibrate_robot(r) for r in readings], MASTER, tracker, cell.target)
-    base = np.array([model.T_world_base for model in setup.models])
-    contact = np.array([model.T_flange_contact for model in setup.models])
-    start = preposition(base, cell.target, clamp_contacts(LAYOUT).T_panel_contact, contact)
-    cell.drive(start)
-    return Ready(cell, setup, readings, start)
-
-
-def read(cell: PanelCell, tracker: LaserTracker) -> list[ReflectorReadings]:
-    """Reflectors of all robots at the poses of the calibration."""
-    commands = panel_job.calibration_poses(POSES, cell.seed)
-    places = panel_job.calibration(cell, commands)
-    return [
-        ReflectorReadings(name, commands[:, i], places[:, i], tracker.sigma(places[:, i]))
-        for i, name in enumerate(NAMES)
-    ]
+        if deviations[-1].max() <= job.tolerance:
+            return deviations, forces
+        job = replace(job, flanges=result.shape_commands)
+        cell.drive(job.flanges)
+    raise NoResultError(f"shape: still {deviations[-1].max():.2f} mm off after {_MOST_CORRECTIONS} corrections")
 
 
 def pose_error(cell: PanelCell) -> np.ndarray:
@@ -186,15 +104,6 @@ def pose_error(cell: PanelCell) -> np.ndarray:
     T = rigid_fit(targets, cell.true_points(targets), np.ones(len(targets))).T
     e = frames.log(frames.inverse(cell.target) @ T)
     return np.concatenate([np.degrees(e[:3]), e[3:]])
-
-
-def shape_run(seed: int, compliant: bool, axes: np.ndarray, robots: str = "", tolerance: float = TOLERANCE) -> ShapeRun:
-    """One adjustment of the pose, then corrections of the shape along some axes."""
-    r = ready(seed, sizes=ROBOTS[robots])
-    stand = run_pose(r.cell, r.setup, panel_job.pose_targets(), r.T_base_flange)
-    r.cell.compliant = compliant
-    control = ControlPoints(*panel_job.control_points(), clamp_contacts(LAYOUT).T_panel_contact)
-    return run_shape(r.cell, r.setup, control, stand, tolerance=tolerance, axes=axes)
 
 
 def jobs(seeds: range) -> Iterator[Row]:
@@ -212,19 +121,25 @@ def jobs(seeds: range) -> Iterator[Row]:
 
 def _pose(job: Row) -> Row:
     """True errors of the panel's pose before and after one adjustment, and the largest change of force."""
-    r = ready(job["seed"], sizes=ROBOTS[job["robots"]])
-    before = pose_error(r.cell)
-    run_pose(r.cell, r.setup, panel_job.pose_targets(), r.T_base_flange)
-    force = np.linalg.norm(r.cell.state()[2][:, 3:], axis=1).max()
-    return {"before": before.tolist(), "after": pose_error(r.cell).tolist(), "force": float(force)}
+    cell, ready = calibrated(job["seed"], sizes=ROBOTS[job["robots"]])
+    cell.lay()
+    before = pose_error(cell)
+    adjust_panel(cell, ready)
+    force = np.linalg.norm(cell.state()[2][:, 3:], axis=1).max()
+    return {"before": before.tolist(), "after": pose_error(cell).tolist(), "force": float(force)}
 
 
 def _shape(job: Row) -> Row:
     """Largest deviation before every correction and at the end, and the largest forces at the end."""
-    run = shape_run(job["seed"], *SHAPES[job["shape"]])
-    forces = run.forces[-1][:, 3:]
+    compliant, axes, robots = SHAPES[job["shape"]]
+    cell, ready = calibrated(job["seed"], sizes=ROBOTS[robots])
+    cell.lay()
+    ready = adjust_panel(cell, replace(ready, axes=axes))
+    cell.compliant = compliant
+    deviations, measured = correct_shape(cell, ready)
+    forces = measured[-1][:, 3:]
     ends = {"force": np.linalg.norm(forces, axis=1).max(), "in_plane": np.linalg.norm(forces[:, :2], axis=1).max()}
-    return {"deviations": [float(d.max()) for d in run.deviations], **{key: float(f) for key, f in ends.items()}}
+    return {"deviations": [float(d.max()) for d in deviations], **{key: float(f) for key, f in ends.items()}}
 
 
 def _leg(job: Row) -> Row:
@@ -232,47 +147,41 @@ def _leg(job: Row) -> Row:
     hidden = np.zeros((6, 6))
     hidden[2, 3] = job["size"]
     cell = PanelCell(1000 + job["seed"], leg_offsets=hidden)
-    wrong = 0
-    for i, reading in enumerate(read(cell, LaserTracker(cell.tracker))):
-        model = calibrate_robot(reading)
-        offset = find_leg_offset(reading, model, LEGS, 36)
-        if i != 2:
-            wrong += bool(offset.found)
-            continue
-        better = model
-        if offset.found:
-            real = true_flanges(LEGS, reading.T_base_flange, [(offset.leg, offset.offset)])
-            better = calibrate_robot(replace(reading, T_base_flange=real))
-        T_base_world = frames.inverse(cell.T_world_base[2])
-        off = [float(np.linalg.norm((T_base_world @ m.T_world_base)[:3, 3])) for m in (model, better)]
-        row = {"found": bool(offset.found), "right": bool(offset.found and offset.leg == 4), "base": off}
-        row |= {"offset": float(offset.offset), "sigma": float(offset.sigma)}
-    return {**row, "wrong": wrong}
+    measured = measured_job(cell, LEGS)
+    models, offsets = calibrate_robots(measured)
+    offset = offsets[2]
+    T_base_world = frames.inverse(cell.T_world_base[2])
+    pair = (calibrate_robot(measured.calibration[2]), models[2])
+    off = [float(np.linalg.norm((T_base_world @ m.T_world_base)[:3, 3])) for m in pair]
+    row = {"found": bool(offset.found), "right": bool(offset.found and offset.leg == 4), "base": off}
+    row |= {"offset": float(offset.offset), "sigma": float(offset.sigma)}
+    return {**row, "wrong": sum(bool(other.found) for other in offsets if other is not offset)}
 
 
 def _drift(job: Row) -> Row:
     """What a motion of the source does to the slaves: true twists (3, N, 6), and the largest that the model expects."""
     turn, step = MOTIONS[job["motion"]]
-    r = ready_without_panel(job["seed"])
-    r.cell.sizes = replace(r.cell.sizes, leg=job["leg"])
-    r.cell.drive(r.T_base_flange)
-    models = r.setup.models
-    expected = errors_along_motion(models, r.T_base_flange, MASTER, np.array([step]), turn=turn)
+    cell, ready = calibrated(job["seed"])
+    stand = ready.flanges
+    cell.sizes = replace(cell.sizes, leg=job["leg"])
+    cell.drive(stand)
+    models, _ = calibrate_robots(ready)
+    expected = errors_along_motion(models, stand, MASTER, np.array([step]), turn=turn)
     drawn: list[Array] = []
     bases = np.array([m.T_world_base for m in models])
     change = []
     for axis in range(3):
-        before = r.cell.clamps()
+        before = cell.clamps()
         motion = np.zeros(6)
         motion[axis if turn else 3 + axis] = step
-        T = r.T_base_flange[MASTER].copy()
+        T = stand[MASTER].copy()
         T[:3, :3] = frames.exp(motion)[:3, :3] @ T[:3, :3]
         T[:3, 3] += frames.exp(motion)[:3, 3]
-        moved = follow(bases, r.T_base_flange, MASTER, T)
-        r.cell.drive(moved)
-        change.append(_relative_change(before, r.cell.clamps()).tolist())
-        r.cell.drive(r.T_base_flange)
-        drawn.append(np.sqrt((_drawn_changes(models, r.T_base_flange, moved) ** 2).mean(axis=0)))
+        moved = follow(bases, stand, MASTER, T)
+        cell.drive(moved)
+        change.append(_relative_change(before, cell.clamps()).tolist())
+        cell.drive(stand)
+        drawn.append(np.sqrt((_drawn_changes(models, stand, moved) ** 2).mean(axis=0)))
     closed = [float(expected.position.max()), float(np.degrees(expected.angle.max()))]
     return {"change": change, "expected": closed, "drawn": _worst(np.array(drawn))}
 
@@ -283,7 +192,7 @@ def _relative_change(before: Array, after: Array) -> Array:
     return frames.log(frames.inverse(first) @ then)
 
 
-def _drawn_changes(models: Sequence[RobotModel], flanges: Array, moved: Array, draws: int = 200) -> Array:
+def _drawn_changes(models: tuple[RobotModel, ...], flanges: Array, moved: Array, draws: int = 200) -> Array:
     """The same (draws, N, 6) of cells drawn about the model from its covariance."""
     rng = np.random.default_rng(0)
     xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)

@@ -105,11 +105,10 @@ def cells(chosen: list[str]) -> None:
 def _figures() -> dict[str, tuple[Any, int]]:
     """By the picture's name, with its resolution."""
     from bench import panel, window
-    from stitch.errors import NoResultError
     from stitch.plugins.cells.base_to_base import read_stand, solve_stand
     from stitch.plugins.cells.drilling import read_drill_job, solve_drill_job
-    from stitch.plugins.cells.panel import read_panel_job, solve_panel_job
-    from stitch.plugins.cells.panel_model import SHAPE_AXES, errors_along_motion
+    from stitch.plugins.cells.panel import calibrate_robots, read_panel_job, solve_panel_job
+    from stitch.plugins.cells.panel_model import errors_along_motion
     from stitch.plugins.cells.scan_to_cad import measure_deviations
     from stitch.plugins.cells.window import read_seam_job, solve_seam
     from viz.cells import base_to_base, window_seam
@@ -119,15 +118,15 @@ def _figures() -> dict[str, tuple[Any, int]]:
 
     stand, drilling = read_stand(EXAMPLES / "base_to_base.toml"), read_drill_job(EXAMPLES / "drilling" / "job.toml")
     job, seam = read_panel_job(EXAMPLES / "panel" / "job.toml"), read_seam_job(EXAMPLES / "window" / "seam.toml")
-    ready = panel.ready_without_panel(0)
-    moved = (ready.setup.models, ready.T_base_flange, panel.MASTER)
+    cell, ready = panel.calibrated(0)
+    moved = (calibrate_robots(ready)[0], ready.flanges, panel.MASTER)
     shift = errors_along_motion(*moved, np.linspace(0, 100, 11), turn=False)
     turn = errors_along_motion(*moved, np.radians(np.linspace(0, 2, 11)), turn=True)
-    try:
-        run = panel.shape_run(0, True, SHAPE_AXES, tolerance=0.25)
-    except NoResultError:
-        run = panel.shape_run(0, True, SHAPE_AXES)
-    forces = np.array([np.linalg.norm(f[:, 3:], axis=1).max() for f in run.forces])
+    cell.lay()
+    ready = panel.adjust_panel(cell, ready)
+    cell.compliant = True
+    largest, measured = panel.correct_shape(cell, ready)
+    forces = np.array([np.linalg.norm(f[:, 3:], axis=1).max() for f in measured])
     scan, _, fit = window.fitted_case("door, welding bulge 3 mm, σ 130 mm", 0)
     _, surface = window.part_of("door")
     deviations = measure_deviations(scan, surface, fit.T_base_part, 0.5, surface.size / 60)
@@ -137,7 +136,7 @@ def _figures() -> dict[str, tuple[Any, int]]:
         "panel-clamps": (shape(job, solve_panel_job(job)), 95),
         "window-seam": (window_seam.cuts(seam, solve_seam(seam)), 95),
         "panel-errors": (errors_figure(panel.NAMES, panel.MASTER, shift, turn), 110),
-        "panel-shape": (shape_figure(panel.NAMES, run.deviations, panel.TOLERANCE, forces), 110),
+        "panel-shape": (shape_figure(panel.NAMES, largest, panel.TOLERANCE, forces), 110),
         "window-map": (deviation_map(deviations, "mm"), 100),
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.panel import LAYOUT, LEGS, pose_error, read, ready, run_pose, run_shape
+from bench.panel import LAYOUT, LEGS, adjust_panel, calibrated, correct_shape, measured_job, pose_error
 from data_synth.cells import hexapod, panel_job
 from data_synth.cells.panel import PanelCell, Sizes
 from data_synth.fixtures.edits import replace_text
@@ -22,7 +22,6 @@ from stitch.plugins.cells.panel import read_panel_job, solve_panel_job
 from stitch.plugins.cells.panel_model import (
     ClampLayout,
     ControlPoints,
-    LaserTracker,
     RobotModel,
     adjust_pose,
     calibrate_robot,
@@ -102,7 +101,7 @@ def test_global_model_is_within_its_sigmas():
     """Twelve unknowns of six robots: chi-square of 72, beyond 117 by a chance of 1e-3... and of the residuals too."""
     cell = PanelCell(5, Sizes(leg=0.0))
     p = []
-    for i, reading in enumerate(read(cell, LaserTracker(cell.tracker))):
+    for i, reading in enumerate(measured_job(cell).calibration):
         model = calibrate_robot(reading)
         off = frames.log(np.linalg.inv(cell.T_world_base[i]) @ model.T_world_base)
         assert off @ np.linalg.solve(model.covariance[:6, :6], off) < 27.9  # chi-square of 6, chance 1e-4
@@ -143,7 +142,7 @@ def test_hidden_leg_offset_is_found_in_its_robot_only():
     hidden = np.zeros((6, 6))
     hidden[2, 3] = 0.5
     cell = PanelCell(11, leg_offsets=hidden)
-    readings = read(cell, LaserTracker(cell.tracker))
+    readings = measured_job(cell).calibration
     found = [find_leg_offset(r, calibrate_robot(r), LEGS, 36) for r in readings]
     assert [f.found for f in found] == [False, False, True, False, False, False]
     assert found[2].leg == 4
@@ -211,17 +210,17 @@ def test_plate_strip_bends_as_a_beam():
 
 def test_pose_after_one_adjustment_and_shape_within_three_iterations():
     """The source's own limits: 0.08 mm, 0.008°, 0.6 mm; measured against the true places of the targets."""
-    r = ready(2)
-    cell = r.cell
-    stand = run_pose(cell, r.setup, panel_job.pose_targets(), r.T_base_flange)
+    cell, ready = calibrated(2)
+    cell.lay()
+    ready = adjust_panel(cell, ready)
     turned, moved = np.split(np.abs(pose_error(cell)), 2)
     assert moved.max() < 0.08 and turned.max() < 0.008
 
     cell.compliant = True
     control, clamp = panel_job.control_points()
     contact = clamp_contacts(LAYOUT).T_panel_contact
-    shaped = run_shape(cell, r.setup, ControlPoints(control, clamp, contact), stand, tolerance=0.6)
-    assert shaped.deviations[0].max() > 3 and len(shaped.deviations) <= 4
+    deviations, _ = correct_shape(cell, ready)
+    assert deviations[0].max() > 3 and len(deviations) <= 4
     world = np.linalg.inv(cell.target) @ np.vstack([cell.true_points(control).T, np.ones(18)])
     across = np.einsum("ki,ki->k", world[:3].T - control, contact[clamp][:, :3, 2])
     assert np.abs(across).max() < 0.6
