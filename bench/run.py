@@ -18,7 +18,6 @@ from bench import harness  # noqa: E402
 TABLES = {
     "axes": "cells:AXES",
     "certificate": "metrology:CERTIFICATES",
-    "base-to-base": "base_to_base:TABLE",
     "blind": "blind:TABLE",
     "deciding-view": "next_views:DECIDING",
     "degenerate": "degenerate:TABLE",

@@ -396,16 +396,9 @@ def _number(n: Number, ratio: float | None) -> dict[str, Any]:
         "kind": n.feature.kind,
         "at": None if n.feature.kind == "distance" else n.feature.at.tolist(),
         "normal": n.feature.axis.tolist() if n.feature.kind in ("point", "plane", "deviation") else None,
-        "quantity": n.quantity,
-        "unit": n.unit,
-        "value": n.value,
-        "nominal": n.nominal,
-        "u": n.u,
-        "U": n.U,
+        **{key: getattr(n, key) for key in ("quantity", "unit", "value", "nominal", "u", "U", "conforms", "points")},
         "degrees_of_freedom": n.degrees,
         "limits": None if n.limits is None else list(n.limits),
-        "conforms": n.conforms,
-        "points": n.points,
         "form_95": n.form,
         "budget": [
             {"source": source, "variance_share": share, "u": n.u * float(np.sqrt(share)), "unit": n.unit}

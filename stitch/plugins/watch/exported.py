@@ -27,6 +27,9 @@ _OF_CELLS: tuple[tuple[str, str, Callable[[CellReport], float]], ...] = (
     ("stitch_cell_last_session_seconds", "Time of the last session, seconds since 1970.", lambda r: r.last),
 )
 REPORT_FORMAT = "stitch-watch/1"
+# Keys that are called as the fields that they hold.
+_KEYS_OF_PARAMETERS = ("name", "unit", "value", "sigma", "common_sigma", "scatter", "drift_per_day", "drift_sigma")
+_KEYS_OF_PARAMETERS += ("process_noise", "limit")
 
 
 def dfq_text(history: History, report: CellReport) -> str:
@@ -98,17 +101,8 @@ def iso_time(time: float | None) -> str | None:
 
 def _parameter_document(report: CellReport, p: ParameterReport) -> dict[str, Any]:
     return {
-        "name": p.name,
-        "unit": p.unit,
-        "value": p.value,
-        "sigma": p.sigma,
-        "common_sigma": p.common_sigma,
-        "scatter": p.scatter,
-        "drift_per_day": p.drift_per_day,
-        "drift_sigma": p.drift_sigma,
-        "process_noise": p.process_noise,
+        **{key: getattr(p, key) for key in _KEYS_OF_PARAMETERS},
         "follows": [vars(f) for f in p.follows],
-        "limit": p.limit,
         "valid_until": iso_time(p.valid_until),
         "alarm": None if p.alarm is None else _change_document(report, p.alarm),
         "changes": [_change_document(report, c) for c in p.changes],
@@ -120,10 +114,6 @@ def _change_document(report: CellReport, c: Change) -> dict[str, Any]:
         "since": report.run_names[c.since],
         "since_time": iso_time(report.run_times[c.since]),
         "raised": report.run_names[c.raised],
-        "kind": c.kind,
-        "p_value": c.p_value,
-        "channel": c.channel,
-        "size": c.size,
+        **{key: getattr(c, key) for key in ("kind", "p_value", "channel", "size", "chart")},
         "size_sigma": c.sigma,
-        "chart": c.chart,
     }
