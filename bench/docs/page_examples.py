@@ -2,7 +2,17 @@
 [--check].
 
 Tests run them too and compare. What must lie in the folder of a page before its first command runs stands in PREPARE,
-and what stands on it beside their output in AFTER, both by the page's name without `.md`.
+and what stands on it beside their output in AFTER, both by the page's name without `.md`. Which blocks are run, which
+are only parsed, which can be neither:
+
+| block | what the tests do with it |
+|---|---|
+| `console` | lines behind `$ ` are run, in one folder for each page; what they print stands below them |
+| `sh` | forms of commands, with words in capitals for what one has oneself: every `stitch` among them has to parse |
+| `python` | run, from the first of the page to the last |
+| toml, csv, text, diff, mermaid | looked at by tests of their own, or by nobody |
+
+A block below a line `<!-- not run: why -->` is left alone.
 """
 
 import argparse
@@ -18,12 +28,15 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import cache
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import typer
 
-from bench.docs.page_blocks import PAGES, ROOT, blocks, commands, examples
 from data_synth import kinematics
 from data_synth.commands import synth
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -33,6 +46,7 @@ from data_synth.fixtures.robot_programs import program
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from data_synth.fixtures.true_arm import true_flanges
 from data_synth.scene import load_scene
+from stitch.cli.main import build
 from stitch.cli.main import main as stitch
 from stitch.effects.contract import EFFECTS
 from stitch.numerics.frames import Array
@@ -52,6 +66,10 @@ END
 # Seconds are the machine's own.
 _SECONDS = re.compile(r"(│ +)(\d+\.\d\d)( │)$", re.MULTILINE)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")))
+LANGUAGES = ("console", "sh", "python", "toml", "csv", "text", "diff", "yaml", "sql")
+_BLOCK = re.compile(r"(?:^<!-- not run: ([^\n]+) -->\n)?^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 def main() -> None:
@@ -280,6 +298,66 @@ def compensated(text: str, folder: Path) -> str:
 
 
 AFTER: dict[str, Callable[[str, Path], str]] = {"back-into-the-cell": compensated}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: str  # from the root of the project
+    language: str
+    text: str
+    not_run: str | None  # why
+
+
+def blocks(page: Path) -> list[Block]:
+    """All fenced blocks of a page, in their order."""
+    name, text = str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
+    return [Block(name, language, body, why) for why, language, body in _BLOCK.findall(text)]
+
+
+def commands(example: str) -> list[str]:
+    """The command lines of a `console` block, in order."""
+    return [line.removeprefix("$ ") for line in example.splitlines() if line.startswith("$ ")]
+
+
+def examples(page: Path) -> list[str]:
+    """What the `console` blocks of a page show, without those that are not run."""
+    return [b.text for b in blocks(page) if b.language == "console" and not b.not_run]
+
+
+@cache
+def _stitch() -> Any:
+    return typer.main.get_command(build())
+
+
+def refused(line: str, named_only: bool = False) -> str | None:
+    """Why the command line `stitch …` does not parse, or None: unknown commands, options, too few or many words.
+
+    Values are not looked at: they may be words in capitals that stand for what one has oneself.
+
+    Args:
+        named_only: it stands in a sentence, where words that the command needs may lack, behind an option too.
+    """
+    # Brackets say that something may be left out.
+    words = shlex.split(re.sub(r"\[=[^]]*\]|[][]", "", line.replace("…", "X")), comments=True)[1:]
+    command = _stitch()
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        if words[0] not in command.commands:
+            return f"no command {words[0]!r}"
+        command = command.commands[words.pop(0)]
+    if named_only and words and words[-1].startswith("-"):
+        known = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}
+        return None if words[-1] in {*known, "--help", "--version"} else f"no option {words[-1]}"
+    try:
+        values, left, _ = command.make_parser(typer.Context(command)).parse_args(list(words))
+    except Exception as error:
+        return str(error)
+    lacking = [p.name for p in command.params if p.required and values.get(p.name) in (None, ())]
+    asked = named_only or {"--help", "--version"}.intersection(words)
+    if left or (lacking and not asked):
+        return f"left over {left}, lacking {lacking}"
+    return None
 
 
 if __name__ == "__main__":

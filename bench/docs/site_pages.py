@@ -25,7 +25,7 @@ from PIL import Image
 from typer.cli import get_docs_for_click
 
 import stitch
-from bench.docs.page_blocks import ROOT
+from bench.docs.page_examples import ROOT
 from stitch import MODULES
 from stitch.cli.effects import parameter_signature
 from stitch.cli.main import build

@@ -8,7 +8,7 @@ import pytest
 import stitch.diagnosis.validation as validation
 import stitch.output.finding_screen as finding_screen
 import stitch.output.plain_finding as plain
-from bench.docs.page_blocks import refused
+from bench.docs.page_examples import refused
 from stitch.api import stepwise
 from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis

@@ -19,7 +19,7 @@ import typer
 
 import stitch
 from bench import run as bench_run
-from bench.docs.page_blocks import LANGUAGES, PAGES, ROOT, blocks, refused
+from bench.docs.page_examples import LANGUAGES, PAGES, ROOT, blocks, refused
 from bench.docs.site_pages import pages
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
 from stitch.api.pipeline import diagnose, run

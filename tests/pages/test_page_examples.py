@@ -14,8 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import stitch
-from bench.docs.page_blocks import PAGES, blocks, examples
-from bench.docs.page_examples import PROGRAM, differences, moved_line, printed, tool_errors
+from bench.docs.page_examples import PAGES, PROGRAM, blocks, differences, examples, moved_line, printed, tool_errors
 from bench.docs.site_pages import NOTEBOOK, NOTEBOOKS, cells, notebook_page, printed_in, run_cells
 from stitch.effects import EFFECTS
 from tests.needs import needs_open3d

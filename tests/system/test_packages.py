@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 import stitch
-from bench.docs.page_blocks import refused
+from bench.docs.page_examples import refused
 from bench.licences import brought, complaints, kind, licence
 from stitch.api.run import Stitched
 from stitch.errors import InputError
