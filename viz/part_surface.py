@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from stitch.errors import NoResultError
 from stitch.numerics.frames import Array, Indices
-from stitch.output.comparison.disagreement_field import Patches
+from stitch.output.comparison.disagreement_field import Patches, facing_side, group_points
 from stitch.output.mesh import TriangleMesh, mesh_of, spacing
 from stitch.run_data import FusedCloud
 from stitch.session.scan import even_indices
@@ -208,9 +208,5 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     # As stitched.ply holds them: a page that is made anew is the same.
     points, normals = (take_mapped(x, some)[keep].astype("f4").astype(float) for x in (fused.points, fused.normals))
     size = float(np.ptp(points, axis=0).max()) / _FINENESS
-    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-    side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))
-    _, group = np.unique(np.ravel_multi_index((*cell.T, side), (*(cell.max(axis=0) + 1), 6)), return_inverse=True)
-    count = np.bincount(group)[:, None]
-    point, normal = (np.stack([np.bincount(group, x) for x in v.T], axis=1) / count for v in (points, normals))
-    return point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    _, point, normal = group_points(points.T, normals.T, facing_side(normals.T), size)
+    return point, normal

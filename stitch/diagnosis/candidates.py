@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -77,6 +78,11 @@ class Candidate:
     def parameters(self) -> tuple[Parameter, ...]:
         """All P parameters at zero."""
         return self.forms[0].term.parameters
+
+    @property
+    def forms_by_term(self) -> list[list[Form]]:
+        """The forms of each term, one for each value of the effect's grid; they share the response of the term."""
+        return [list(forms) for _, forms in groupby(self.forms, key=lambda form: id(form.term))]
 
     @property
     def empirical(self) -> bool:

@@ -29,6 +29,7 @@ from stitch.diagnosis.ranking import (
     conditioned_on_effects,
     is_certain,
     is_contender,
+    likeliest_first,
     rank_one,
     too_large,
 )
@@ -294,8 +295,7 @@ def could_it_be_the_base(case: Case, evidence: Evidence) -> Reply | None:
         return None
     of_base = laws_of_base(case.linear, case.dictionary, evidence.reported_laws)
     laws = {law_of(r).key: r for r in (*evidence.laws, *of_base)}
-    ranked = tuple(sorted(laws.values(), key=lambda r: -r.log_posterior))
-    return Reply(names_of(of_base) or "no", {"laws": ranked} if of_base else {})
+    return Reply(names_of(of_base) or "no", {"laws": likeliest_first(laws.values())} if of_base else {})
 
 
 TESTS: tuple[Question, ...] = (

@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.ranking import Ranked, likeliest_first
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, try_form
 from stitch.diagnosis.systematic_laws import BODIES, Dictionary, Law, LawEffect, bodies_of, law_of
@@ -65,8 +65,7 @@ def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]
         # Bonferroni over the laws, and over the forms of the law by their shares.
         p_value = fits[best].p_value / float(shares[best]) * len(forms_of)
         ranked.append(Ranked(replace(fits[best], log_bayes_factor=total), p_value, total + prior, 0.0, len(forms_of)))
-    ranked.sort(key=lambda r: -r.log_posterior)
-    first, *others = ranked
+    first, *others = likeliest_first(ranked)
     others = [replace(r, adjusted=min(r.adjusted, 1.0)) for r in others]
     return replace(first, adjusted=_family_wise(linear, dictionary, first)), *others
 

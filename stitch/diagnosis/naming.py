@@ -23,6 +23,7 @@ from stitch.diagnosis.ranking import (
     conditioned_on_effects,
     is_certain,
     is_contender,
+    likeliest_first,
     rank,
     rank_all,
     rank_one,
@@ -154,7 +155,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         contenders = [rescored_in(base, r) for r in contenders]
     ranked = _raise_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
-    contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
+    contenders = likeliest_first(case.dictionary.credited(r, laws) for r in contenders)
     best = contenders[0]
     rivals = case.dictionary.without(base, laws, best)
     unmodelled = max([unmodelled_log_posterior(base), *(r.log_posterior for r in rivals)])
@@ -165,7 +166,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         "explanation": (best,),
         "together": (best,),
         "shape": shape and (shape if shape in rivals else rescored_in(base, shape)),
-        "contenders": tuple(contenders),
+        "contenders": contenders,
         "base": base,
         "unmodelled_log_posterior": unmodelled,
         "ranked": rescored_against(ranked, best, unmodelled),
@@ -340,7 +341,7 @@ def _raise_hidden(ranked: Sequence[Ranked], first: Ranked, contenders: Sequence[
             log_posterior=first.log_posterior + nats,
             posterior=posterior * float(np.exp(nats)),
         )
-    return tuple(sorted((raised.get(r.name, r) for r in ranked), key=lambda r: -r.log_posterior))
+    return likeliest_first(raised.get(r.name, r) for r in ranked)
 
 
 def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:

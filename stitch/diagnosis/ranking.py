@@ -1,6 +1,6 @@
 """Candidates in the order of their log Bayes factor, and which of them are enough for a name."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -121,6 +121,11 @@ def too_large(named: Sequence[Ranked]) -> tuple[str, ...]:
 def beyond_belief_text(names: Sequence[str]) -> str:
     """Return which parameters are larger than is believed of them."""
     return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} larger than is believable"
+
+
+def likeliest_first(ranked: Iterable[Ranked]) -> tuple[Ranked, ...]:
+    """Return candidates in the order of their log posteriors, the largest first."""
+    return tuple(sorted(ranked, key=lambda r: -r.log_posterior))
 
 
 def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:

@@ -12,7 +12,6 @@ counted for nothing.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 import numpy as np
 from scipy.special import logsumexp
@@ -249,7 +248,7 @@ def _information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[
     θ are its parameters in units of their plausible sizes. I and v are computed once per term, for all its parameters;
     forms with fewer of them select rows and columns.
     """
-    of_terms = [list(forms) for _, forms in groupby(candidate.forms, key=lambda form: id(form.term))]
+    of_terms = candidate.forms_by_term
     sums = linear.information([whole.selected for whole, *_ in of_terms])
     for forms, (information, vector) in zip(of_terms, sums, strict=True):
         for form in forms:

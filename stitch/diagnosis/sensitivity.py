@@ -12,7 +12,6 @@ evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter 
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 
 import numpy as np
 from scipy.optimize import brentq
@@ -218,8 +217,7 @@ def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> d
     weights = iter(form_weights(candidate).tolist())
     # By parameter, and by the parameters that a form has free, the sizes in each such form.
     sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
-    for _, forms in groupby(candidate.forms, key=lambda form: id(form.term)):
-        of_term = list(forms)
+    for of_term in candidate.forms_by_term:
         # All columns of the term, whitened, and the degrees of freedom of the scatter along each.
         whole = linear.residual(of_term[0].reduced)
         degrees_alone = scatter.of_each(linear.in_blocks(whole)) if has_singles else None

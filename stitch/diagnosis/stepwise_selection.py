@@ -19,7 +19,15 @@ import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidate_as_fitted, candidates_of
-from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
+from stitch.diagnosis.ranking import (
+    Ranked,
+    conditioned_on_effects,
+    conditioned_without,
+    is_certain,
+    likeliest_first,
+    rank,
+    rank_one,
+)
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
 from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, group_share, untested_ends_reason
@@ -175,8 +183,7 @@ def _stable_selection(
     untested = sorted(name for name, (_, unseen) in removed.items() if unseen)
     if len(untested) > 1:
         refused |= dict.fromkeys(untested, untested_ends_reason(untested))
-    likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
-    return ForwardSelection(likeliest_first, explained, refused)
+    return ForwardSelection(likeliest_first(chosen), explained, refused)
 
 
 def _worst_at_ends(
@@ -433,4 +440,4 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
             return chosen, idle
         idle[first[0].name] = first[1]
         rest = [r for r in chosen if r.name != first[0].name]
-        chosen = sorted(filter(is_certain, parallel(partial(beside, rest), rest)), key=lambda r: -r.log_posterior)
+        chosen = list(likeliest_first(filter(is_certain, parallel(partial(beside, rest), rest))))

@@ -175,8 +175,7 @@ def _swings(
     time = time_in_steps(linear.measurement)
     for f in map(float, frequencies):
         words = f"swing to and fro about every {_duration_in_words(linear, 1 / f)}"
-        trends = [partial(_wave_at_phase, f, phase) for phase in phases] if phases else [partial(_waves, f)]
-        for trend in trends:
+        for trend in [partial(_wave, f, phase) for phase in phases] or [partial(_waves, f)]:
             yield SmoothProcess(None, carried, trend(time), _SWING_IN_PHASE if phases else _SWING, words, trend, f)
 
 
@@ -186,9 +185,9 @@ def _waves(frequency: float, time: Array) -> Array:
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
-def _wave_at_phase(frequency: float, phase: float, time: Array) -> Array:
+def _wave(frequency: float, phase: float, time: Array) -> Array:
     """Return the wave (T, 1) of a frequency (1/step) with one phase (rad), at times (T,) in steps."""
-    return _waves(frequency, time) @ np.array([[np.cos(phase)], [np.sin(phase)]])
+    return np.cos(2 * np.pi * frequency * time - phase)[:, None]
 
 
 def _stretches(linear: LinearModel, carried: Array, time: Array) -> Iterator[SmoothProcess]:

@@ -143,7 +143,7 @@ class _Correspondences:
             np.concatenate([getattr(m, name).T for m in matches], axis=1).compress(self.inside, axis=1)
             for name in ("middle", "normal")
         )  # (3, R)
-        self.side = _facing_side(self.normal)
+        self.side = facing_side(self.normal)
         sides = [np.concatenate([np.full(len(m.residual), getattr(m, side)) for m in matches]) for side in "vw"]
         self.view = np.concatenate([side[self.inside] for side in sides]).astype(np.int64)  # (2R,) first all v
 
@@ -158,13 +158,13 @@ class Patches:
             pairs: the R correspondences.
             radius: standard deviation of the weights, length_unit.
         """
-        cell, centre, facing = _group_points(pairs.middle, pairs.normal, pairs.side, _CELL * radius)
+        cell, centre, facing = group_points(pairs.middle, pairs.normal, pairs.side, _CELL * radius)
         self._inside = pairs.inside
         self._cell_of = np.concatenate([cell, cell]) * pairs.view_count + pairs.view
         counts = np.bincount(self._cell_of, minlength=len(centre) * pairs.view_count)
         self._counts = counts.reshape(len(centre), pairs.view_count).astype(float)  # (C, V)
-        sides = _facing_side(facing.T)
-        _, self.points, self.normals = _group_points(centre.T, facing.T, sides, _APART * radius)  # (K, 3), outwards
+        sides = facing_side(facing.T)
+        _, self.points, self.normals = group_points(centre.T, facing.T, sides, _APART * radius)  # (K, 3), outwards
         self.radius = radius  # standard deviation of the weights, length_unit
         self._kernel = _kernel(self.points, self.normals, centre, facing, radius)
         self.sigma = self._standard_errors(pairs.distances)  # (V, K) of the means, NaN where nobody can say
@@ -225,18 +225,18 @@ def _kernel(place: Array, outwards: Array, centre: Array, facing: Array, radius:
     return csr_matrix((weights, (row, index[within])), shape=(len(place), len(centre)))
 
 
-def _facing_side(normals: Array) -> Indices:
+def facing_side(normals: Array) -> Indices:
     """Return for normals (3, N) the number (N,), 0 … 5, of the cube's side that each faces most."""
     axis = np.abs(normals).argmax(axis=0)
     return 2 * axis + (normals[axis, np.arange(len(axis))] > 0)
 
 
-def _group_points(points: Array, normals: Array, side: Indices, size: float) -> tuple[Indices, Array, Array]:
+def group_points(points: Array, normals: Array, side: Indices, size: float) -> tuple[Indices, Array, Array]:
     """Group points by the cells of a cubic grid and by the side that they face; the two faces of a sheet stay apart.
 
     Args:
         points, normals: (3, N).
-        side: (N,) number of the side of a cube that each normal faces (`_facing_side`).
+        side: (N,) number of the side of a cube that each normal faces (`facing_side`).
         size: edge of a cell, in the unit of the points.
 
     Returns:
