@@ -137,8 +137,8 @@ class Session(SessionData):
             has_poses = poses is not None or joints is not None or not axes
             poses = _read_tables(cell, poses, scans, cloud_unit or unit) if has_poses else poses
             T, q = _arm(cell, names, poses, joints) if has_poses else (np.tile(np.eye(4), (len(names), 1, 1)), None)
-            views = _measured_views(cell, names, scans, points, cloud_unit or unit)
-            session = replace(cell, views=_placed_views(views, T, q, times, covariates or {}))
+            read_scans = _clouds_of(cell, names, scans, points, cloud_unit or unit)
+            session = replace(cell, views=_views(names, read_scans, points, T, q, times, covariates or {}))
             session = _with_axes(replace(session, has_poses=has_poses), axes)
             check_scale(session, cloud_unit or unit)
             # Conventions are tried of poses that axes do not change.
@@ -353,13 +353,13 @@ def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session
     return public_session(place_stated_axes(session, axes)) if axes else session
 
 
-def _measured_views(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[View]:
-    """Return one view per name with its cloud or labelled points; the pose is still the identity, all else unknown.
+def _clouds_of(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[Cloud | None]:
+    """Return the checked cloud of each view; None of one that shows labelled points alone.
 
     Args:
         cell: session without views, for its scanner and length unit.
         scans: V clouds, or None for each.
-        points: V mappings from a target's name to its place (3,) in the sensor frame; None: no labelled points.
+        points: V mappings of labelled points; None: there are none.
         cloud_unit: length unit of the clouds, "mm" or "m".
 
     Raises:
@@ -385,28 +385,23 @@ def _measured_views(cell: Session, names: list[str], scans: list[Any], points: A
         # A small scan is the session's own; a large one stays with whoever holds it.
         return replace(cloud, points=cloud.points.copy()) if cloud.points is scans[v] else cloud
 
-    clouds = list(parallel(cloud_of_view, range(len(names)), "reading scans"))
-    return [
-        View(
-            name=name,
-            cloud=clouds[v],
-            T_base_flange=np.eye(4),
-            joints=None,
-            approach=None,
-            time_s=None,
-            covariates={},
-            sighting=None if points is None else sighting_of(points[v], f"view {name}"),
-        )
-        for v, name in enumerate(names)
-    ]
+    return list(parallel(cloud_of_view, range(len(names)), "reading scans"))
 
 
-def _placed_views(
-    views: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
+def _views(
+    names: list[str],
+    clouds: list[Cloud | None],
+    points: Any,
+    T: Array,
+    q: Array | None,
+    times: Any,
+    covariates: Mapping[str, Any],
 ) -> tuple[View, ...]:
-    """Return the views with poses, joint angles, directions of approach, times and covariates filled in.
+    """Return the views: what each shows, its pose, joint angles, directions of approach, time and covariates.
 
     Args:
+        clouds: of each view; None: of one that shows labelled points alone.
+        points: V mappings from a target's name to its place (3,) in the sensor frame; None: no labelled points.
         T: (V, 4, 4) T_base_flange, length_unit.
         q: (V, n) joint angles, rad; None: unknown, and the approach too.
         times: (V,) s that never decrease; None: unknown.
@@ -415,29 +410,30 @@ def _placed_views(
     Raises:
         InputError: times that decrease or are not finite, or values of another number than views.
     """
-    count = len(views)
+    count = len(names)
     time = None if times is None else seconds_of(times, count, "times")
     if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
         raise InputError(
             "times: not finite, or a later view stands before an earlier one; to fix: sort the views by time"
         )
-    names = [require_covariate_name("covariates", str(name)) for name in covariates]
     columns = {
-        name: per_view(values, count, f"covariates {name}")
-        for name, values in zip(names, covariates.values(), strict=True)
+        require_covariate_name("covariates", str(name)): per_view(values, count, f"covariates {name}")
+        for name, values in covariates.items()
     }
     # As in views.csv: the sign of the travel from the view before, 0 in the first view.
     approach = None if q is None else np.sign(np.diff(q, axis=0, prepend=q[:1]))
     return tuple(
-        replace(
-            view,
+        View(
+            name=name,
+            cloud=clouds[v],
             T_base_flange=T[v],
             joints=None if q is None else q[v],
             approach=None if approach is None else approach[v],
             time_s=None if time is None else float(time[v]),
             covariates={key: float(x[v]) for key, x in columns.items() if np.isfinite(x[v])},
+            sighting=None if points is None else sighting_of(points[v], f"view {name}"),
         )
-        for v, view in enumerate(views)
+        for v, name in enumerate(names)
     )
 
 
