@@ -14,11 +14,13 @@ from matplotlib.text import Text
 matplotlib.use("Agg")
 
 
-def plain(figure: Figure) -> Figure:
-    """No frame at the top and on the right."""
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure
+def subplots(width: float, height: float, *grid: int, **options: Any) -> tuple[Figure, Any]:
+    """Return a figure (inches) and its axes, as `Figure.subplots` makes them; no frame at the top and on the right."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(*grid, **options)
+    for ax in figure.axes:
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure, axes
 
 
 def above(axes: Axes) -> None:

@@ -156,7 +156,7 @@ def log_model(
     recording.log("stitched", rr.Points3D(rest.astype(np.float32), colors=[GREY]), static=True)
     at_rest = [frames.transform(run.poses[v], shown_points(run.session.views[v])) for v in scene.farthest]
     for v, own, colour in zip(scene.farthest, at_rest, COLOURS_OF_FEW, strict=False):
-        points = own[np.linspace(0, len(own) - 1, min(len(own), _POINTS)).astype(int)] - scene.centre
+        points = own[even_indices(len(own), _POINTS)] - scene.centre
         scan = rr.Points3D(points.astype(np.float32), colors=[colour])
         recording.log(["scans", scene.names[v]], scan, static=True)
     places = one_above_the_other(at_rest, up)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from stitch.output.comparison.model_history import model_history
 from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE
-from viz.figures import plain
+from viz.figures import subplots
 from viz.part_picture import error_falling, part_picture
 from viz.run_numbers import residual_vectors
 from viz.run_page import page_with_diagnosis, report_html
@@ -59,11 +59,11 @@ def _sticks(run: RunData) -> Figure:
     place, unit = run.targets.landmarks.positions, run.session.length_unit
     size = float(np.nanmax(np.ptp(place[target], axis=0))) or 1.0
     magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(residual, axis=1), 0.99)), 1e-300)
-    figure = Figure(figsize=(9, 3.4), layout="constrained")
-    for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):
+    figure, planes = subplots(9, 3.4, 1, 3)
+    for axes, (a, b) in zip(planes, _PLANES, strict=True):
         ends = np.stack([place[target], place[target] + magnified * residual], axis=1)[:, :, [a, b]]
         axes.add_collection(LineCollection(ends.tolist(), colors=BLUE, linewidths=0.4, alpha=0.35))
         axes.plot(place[:, a], place[:, b], "o", ms=4, color=ORANGE)
         axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({unit})", ylabel=f"{'xyz'[b]} ({unit})")
     figure.suptitle(f"sticks {magnified:.0f} times longer than they are", fontsize=9)
-    return plain(figure)
+    return figure

@@ -17,7 +17,7 @@ from stitch.plugins.cells.stand import DistanceComparison, Stand, compare_distan
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, GREEN, ORANGE
-from viz.figures import above
+from viz.figures import above, subplots
 from viz.page_parts import Row
 
 # Figures of two robots joined by a stand; each function returns a Figure.
@@ -27,13 +27,11 @@ _ONE, _TWO, _ROD = BLUE, GREEN, ORANGE
 
 def plan(stand: Stand, result: BaseResult) -> Figure:
     """From above and from the side."""
-    figure = Figure(figsize=(10.5, 4.8), layout="constrained")
-    axes = figure.subplots(1, 2)
+    figure, axes = subplots(10.5, 4.8, 1, 2)
     for ax, (i, j) in zip(axes, ((0, 1), (0, 2)), strict=True):
         _draw(ax, stand, result, i, j)
         ax.set(aspect="equal", xlabel=f"{'xyz'[i]} ({stand.length_unit})", ylabel=f"{'xyz'[j]} ({stand.length_unit})")
         ax.margins(0.12)
-        ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -97,8 +95,7 @@ def _ellipse(at: Array, covariance: Array) -> Ellipse:
 def contradictions(comparisons: Sequence[DistanceComparison]) -> Figure:
     """Every comparison's difference in sigmas."""
     shown = comparisons[:12][::-1]
-    figure = Figure(figsize=(7, 0.9 + 0.32 * len(shown)), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots(7, 0.9 + 0.32 * len(shown))
     sizes = [c.sigmas for c in shown]
     ax.barh(
         ["–".join(c.pair) for c in shown],
@@ -112,7 +109,6 @@ def contradictions(comparisons: Sequence[DistanceComparison]) -> Figure:
         xlim=(0, max(1.2 * CONTRADICTION_SIGMAS, 1.1 * max(sizes, default=0.0))),
     )
     above(ax)
-    ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 

@@ -18,6 +18,7 @@ from stitch.plugins.cells.drilling import (
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, GREEN, ORANGE
+from viz.figures import subplots
 from viz.page_parts import Row
 
 # Figures of a drilling job; each function returns a Figure.
@@ -30,8 +31,7 @@ _ARROWS = {"angles": "xy", "scale_units": "xy", "scale": 1}  # as long as they a
 
 def holes(job: DrillJob, result: DrillResult) -> Figure:
     """The panel from above and from its side, before and after: reference holes with error arrows, holes to drill."""
-    figure = Figure(figsize=(10.5, 4.6), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
+    figure, axes = subplots(10.5, 4.6, 2, 2, sharex=True, sharey="row", height_ratios=(2, 1))
     middle, along = _panel_axes(job)
     for column, title in enumerate(("by the drawing", "after the correction")):
         after = column == 1
@@ -82,7 +82,6 @@ def _draw_holes(ax: Axes, job: DrillJob, result: DrillResult, middle: Array, sid
     ax.set_aspect("equal")
     ax.margins(0.12, 0.25)  # below and above, names and arrows have room
     ax.autoscale_view()
-    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _name_holes(ax: Axes, job: DrillJob, middle: Array, side: Array) -> None:
@@ -98,8 +97,7 @@ def _once(ax: Axes, label: str) -> str:
 
 def plate(job: DrillJob, result: DrillResult) -> Figure:
     """Leave-one-out errors of the plate's holes."""
-    figure = Figure(figsize=(4.6, 3.8), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots(4.6, 3.8)
     at, off = job.plate_xyz[:, :2], result.leave_one_out_errors
     ax.scatter(*at.T, s=120, facecolor="none", edgecolor="0.3")
     largest = max(float(np.linalg.norm(off, axis=1).max()), 1e-9)

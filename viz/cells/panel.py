@@ -16,7 +16,7 @@ from stitch.plugins.cells.panel_model import MotionErrors
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, signed_colours
-from viz.figures import above, colormap, save_figure
+from viz.figures import above, colormap, save_figure, subplots
 from viz.page_parts import Row
 
 
@@ -43,8 +43,7 @@ def deviation_before(job: PanelJob, result: PanelResult) -> Array:
 def shape(job: PanelJob, result: PanelResult) -> Figure:
     """Control points on the unrolled panel, coloured by their deviation, before and after."""
     assert job.control is not None
-    figure = Figure(figsize=(10.5, 3.5), layout="constrained")
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    figure, axes = subplots(10.5, 3.5, 1, 2, sharex=True, sharey=True)
     before = deviation_before(job, result)
     limit = max(float(np.abs(before).max()), job.tolerance)
     shown = (("measured", before), ("expected after the correction", expected_after(job, result)))
@@ -83,7 +82,6 @@ def _draw_panel(ax: Axes, job: PanelJob, result: PanelResult) -> None:
         ax.annotate(name, aside, ha="center", va="center", fontsize=13, color="0.45", weight="bold")
     half = job.layout.length / 2
     ax.set(aspect="equal", xlim=(-half - 330, half + 330))
-    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _unrolled(job: PanelJob, points: Array) -> Array:
@@ -95,28 +93,25 @@ def _unrolled(job: PanelJob, points: Array) -> Array:
 def forces(job: PanelJob) -> Figure:
     """Size along z and across it at every clamp."""
     assert job.forces is not None
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
-    ax, place = figure.subplots(), np.arange(len(job.robots))
+    figure, ax = subplots(7, 2.6)
+    place = np.arange(len(job.robots))
     ax.bar(place - 0.2, job.forces[:, 5], 0.38, color=BLUE, label="along z, into the panel")
     ax.bar(place + 0.2, np.linalg.norm(job.forces[:, 3:5], axis=1), 0.38, color=ORANGE, label="in its plane")
     ax.set_xticks(place, job.robots)
     ax.set(ylabel="force (N)", xlabel="clamp")
     ax.axhline(0, color="k", lw=0.6)
     ax.legend(frameon=False)
-    ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
 def misfit(job: PanelJob, result: PanelResult) -> Figure:
     """Root mean square of the weighted residuals of each robot."""
-    figure = Figure(figsize=(7, 2.4), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots(7, 2.4)
     sizes = [np.sqrt(m.chi_square / m.redundancy) for m in result.models]
     ax.bar(job.robots, sizes, color=GREEN)
     ax.axhline(1.0, color="0.4", ls="--", lw=1, label="tracker's sigma")
     ax.set(ylabel="rms (sigmas)", xlabel="robot")
     above(ax)
-    ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -138,8 +133,7 @@ def write_pictures(job: PanelJob, result: PanelResult, folder: Path) -> list[str
 
 def errors_figure(names: Sequence[str], master: int, shift: MotionErrors, turn: MotionErrors) -> Figure:
     """Error against distance and angle, one line per slave: the worst of the three axes."""
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots(2, 2, sharex="row", squeeze=False)
+    figure, axes = subplots(9, 6, 2, 2, sharex="row", squeeze=False)
     rows = ((shift, shift.steps, "distance moved (mm)"), (turn, np.degrees(turn.steps), "angle turned (°)"))
     for row, (errors, steps, label) in enumerate(rows):
         microns, millidegrees = errors.position * 1e3, np.degrees(errors.angle) * 1e3
@@ -166,8 +160,7 @@ def _draw_slaves(ax: Axes, steps: Array, sizes: Array, names: Sequence[str], *, 
 
 def shape_figure(names: Sequence[str], steps: Sequence[Array], tolerance: float, forces: Array) -> Figure:
     """Largest deviation at each clamp, step by step (each (N,) mm), and the largest force (steps,) N."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    deviations, bars = figure.subplots(1, 2)
+    figure, (deviations, bars) = subplots(9, 3.6, 1, 2)
     table = np.array(steps)
     for i, name in enumerate(names):
         deviations.plot(range(len(table)), table[:, i], label=name, **_STYLES[i % len(_STYLES)])

@@ -11,10 +11,11 @@ from stitch.numerics.frames import Array
 from stitch.output.comparison.run_verdict import ToleranceVerdict
 from stitch.plugins.cells.scan_to_cad import Deviations, allowance_sentence
 from stitch.plugins.cells.window import FitJob, FittedPart, agreement_sentence, with_unit
+from stitch.session.scan import even_indices
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, ORANGE, SIGNED, signed_colours
-from viz.figures import colormap
+from viz.figures import colormap, subplots
 from viz.page_parts import Row
 
 # Pictures of a scan on its CAD: the deviation map, and how all distances are spread.
@@ -34,9 +35,8 @@ def deviation_map(found: Deviations, unit: str) -> Figure:
     """
     extent = np.ptp(found.points, axis=0)
     i, j = np.sort(np.argsort(extent)[1:])
-    figure = Figure(figsize=(9, min(_WIDE * extent[j] / extent[i] + 0.8, 9)), layout="constrained")
-    ax = figure.subplots()
-    pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
+    figure, ax = subplots(9, min(_WIDE * extent[j] / extent[i] + 0.8, 9))
+    pick = even_indices(len(found.points), _MAP_POINTS)
     order = pick[np.argsort(np.abs(found.distance[pick]))]
     colours = {"c": found.distance[order], "cmap": colormap(SIGNED), "vmin": -found.tolerance, "vmax": found.tolerance}
     drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
@@ -55,14 +55,12 @@ def deviation_map(found: Deviations, unit: str) -> Figure:
 def histogram(part: FittedPart, unit: str) -> Figure:
     """Distances of all points, with the tolerance."""
     found = part.deviations
-    figure = Figure(figsize=(7, 2.4), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots(7, 2.4)
     reach = max(2 * found.tolerance, 1.05 * float(np.quantile(np.abs(found.distance), 0.999)))
     ax.hist(np.clip(found.distance, -reach, reach), bins=120, color=BLUE, log=True)
     for side in (-1, 1):
         ax.axvline(side * found.tolerance, color=ORANGE, ls="--", lw=1)
     ax.set(xlabel=f"distance from the CAD ({unit}; dashed: tolerance)", ylabel="points", xlim=(-reach, reach))
-    ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -171,7 +169,7 @@ def record(job: FitJob, parts: list[FittedPart], path: Path) -> None:
             T, found = part.fit.T_base_part, part.deviations
             _record_cad(recording, f"part {i + 1}/cad", job, T)
             stage.frame(recording, f"part {i + 1}/frame", T, size / 10)
-            pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _RECORDED_POINTS)).astype(int)
+            pick = even_indices(len(found.points), _RECORDED_POINTS)
             places, colours = (
                 frames.transform(T, found.points[pick]),
                 signed_colours(found.distance[pick], found.tolerance),

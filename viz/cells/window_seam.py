@@ -11,9 +11,11 @@ from stitch.numerics.frames import Array
 from stitch.output.comparison.run_verdict import ToleranceVerdict
 from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station
 from stitch.plugins.cells.window import SeamJob, limits_text, stations_sentence
+from stitch.session.scan import even_indices
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
+from viz.figures import subplots
 from viz.page_parts import Row
 
 _COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, YELLOW, DARK), strict=True))
@@ -65,8 +67,7 @@ def _about(job: SeamJob) -> list[Row]:
 
 def values(limits: Limits, seams: list[Seam]) -> Figure:
     """Flush and gap of every station with two sigmas and their bands."""
-    figure = Figure(figsize=(10, 3.0), layout="constrained")
-    axes = figure.subplots(1, 2)
+    figure, axes = subplots(10, 3.0, 1, 2)
     quantities = (("flush", limits.flush, limits.flush_tolerance), ("gap", limits.gap, limits.gap_tolerance))
     for ax, (name, middle, tolerance) in zip(axes, quantities, strict=True):
         ax.axhspan(middle - tolerance, middle + tolerance, color="0.92")
@@ -76,7 +77,6 @@ def values(limits: Limits, seams: list[Seam]) -> Figure:
             ax.errorbar(k, value, 2 * sigma, fmt="o", color=_COLOURS[s.verdict], capsize=4)
         ax.set_xticks(range(len(seams)), [s.station for s in seams])
         ax.set(xlabel="station", ylabel=f"{name} (mm)")
-        ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -84,8 +84,8 @@ def cuts(job: SeamJob, seams: list[Seam]) -> Figure:
     """Small pictures of the scanned points at each station, across and outwards."""
     columns = min(4, len(seams))
     rows = -(-len(seams) // columns)
-    figure = Figure(figsize=(10.5, 0.5 + 1.25 * rows), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)).ravel()
+    figure, grid = subplots(10.5, 0.5 + 1.25 * rows, rows, columns, sharex=True, sharey=True, squeeze=False)
+    axes = grid.ravel()
     for ax, station, seam in zip(axes, job.stations, seams, strict=False):
         _draw_cut(ax, job, station, seam)
     for ax in axes[len(seams) :]:
@@ -118,8 +118,7 @@ def loop(job: SeamJob, seams: list[Seam]) -> Figure:
     out = np.mean([station.outwards for station in job.stations], axis=0)
     axes_of_plane = _plane(out)
     flat = (middle - middle.mean(axis=0)) @ axes_of_plane.T
-    figure = Figure(figsize=(7, 3.6), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = subplots(7, 3.6)
     reach = 0.05 * float(np.ptp(flat, axis=0).max())
     ax.plot(*np.vstack([flat, flat[:1]]).T, color="0.8", lw=1, ls=":")
     for at, station, seam in zip(flat, job.stations, seams, strict=True):
@@ -131,7 +130,6 @@ def loop(job: SeamJob, seams: list[Seam]) -> Figure:
     ax.set(aspect="equal", xlabel="in the plane of the stations (mm)", ylabel="upwards in it (mm)")
     ax.margins(0.15)
     ax.legend(frameon=False, loc="center")
-    ax.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -147,7 +145,7 @@ def _plane(out: Array) -> Array:
 def record(job: SeamJob, seams: list[Seam], path: Path) -> None:
     """Base frame: scanned points, station frames, the gap as a line between its edges, verdicts as labels."""
     points = job.scan.points
-    pick = np.linspace(0, len(points) - 1, min(len(points), _RECORDED_POINTS)).astype(int)
+    pick = even_indices(len(points), _RECORDED_POINTS)
     words = f"# Seam\n\n{stations_sentence(job.limits, seams)}\n\nThe lines across the seam run from edge to edge."
     with stage.stage(path, "Seam", words) as recording:
         stage.points(recording, "scan", points[pick], [stage.GREY], 0.35)
