@@ -36,6 +36,10 @@ FAULTS = (
 )
 # A component of an axis counts where its sigma is no accident of the axis' own direction.
 _COUNTS = 0.2
+# What is hidden in one of the two, times what the cell has at amplitude 1: twice what development seeds could detect.
+SCANNER_FAULTS = (("field_curvature", 2.0), ("range_scale", 4.0))
+# Of a scanner's frame, where it sees the part, mm.
+_MIDDLE = np.array([0.0, 0.0, 420.0])
 
 
 def jobs(seeds: range, faulty: int = 8) -> Iterator[Row]:
@@ -188,12 +192,6 @@ def _ball_lines(rows: list[Row]) -> list[str]:
 
 _AXES = Parts({"found": (found, _found_lines), "named": (named, _named_lines)})
 AXES = Table(jobs, _AXES.trial, _AXES.summary, range(200, 220), page="axes", block="axes", settings={"faulty": 8})
-
-
-# What is hidden in one of the two, times what the cell has at amplitude 1: twice what development seeds could detect.
-SCANNER_FAULTS = (("field_curvature", 2.0), ("range_scale", 4.0))
-# Of a scanner's frame, where it sees the part, mm.
-_MIDDLE = np.array([0.0, 0.0, 420.0])
 
 
 def scanner_jobs(seeds: range) -> Iterator[Row]:

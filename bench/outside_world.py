@@ -32,6 +32,22 @@ STEEPEST = np.cos(np.radians(65))
 SCATTER = 0.02  # rms displacement at the part of an ordinary arm
 SHARES = np.array([1, 1, 1, 2, 2, 2])  # of the joints in it
 GEOMETRY = 0.02  # the same of its lengths and zeros, most of it without effect on the scans
+# Gears and encoders of a wrist are smaller, and worse by this factor.
+WRIST = 2.5
+# Written once the laws were fixed: the library's effects that are one of them by another name.
+NAMES = {
+    "joint gives way to the load": ("joint_compliance",),
+    "code disc off its centre": ("gear_eccentricity",),
+    "play in a gear": ("backlash",),
+    "poses read late in motion": ("latency",),
+    "coupling creeps in behind a move": ("settling",),
+    "one link grows warm": ("robot_thermal_growth", "link_thermal"),
+    "adapter droops at the flange": ("mount_droop", "mount_bend", "fixture_droop", "fixture_bend"),
+    "scanner is knocked": ("mount_step",),
+    "field of the scanner is a bowl": ("field_curvature",),
+    "steep surfaces look farther": ("incidence_bias",),
+    "near and far look farther": ("range_nonlinearity",),
+}
 
 
 @dataclass
@@ -371,10 +387,6 @@ def _write_csv(file: Path, head: list[str], rows: Any) -> None:
     file.write_text("\n".join([",".join(head), *lines]) + "\n", encoding="utf-8")
 
 
-# Gears and encoders of a wrist are smaller, and worse by this factor.
-WRIST = 2.5
-
-
 @dataclass(frozen=True)
 class Law:
     """One physical error."""
@@ -533,19 +545,4 @@ LAWS = {
     "scanner's axis drifts as it warms": Law("scanner", "scanner_temperature_c", 4e-5, "rad/K", True, _warm_scanner),
     "near and far look farther": Law("scanner", "distance", 0.025, "mm at 50 mm from the middle", False, _far_and_near),
     "nothing": Law("", "", 0.0, "", True, lambda cell, size, rng: None),
-}
-
-# Written once the laws were fixed: the library's effects that are one of them by another name.
-NAMES = {
-    "joint gives way to the load": ("joint_compliance",),
-    "code disc off its centre": ("gear_eccentricity",),
-    "play in a gear": ("backlash",),
-    "poses read late in motion": ("latency",),
-    "coupling creeps in behind a move": ("settling",),
-    "one link grows warm": ("robot_thermal_growth", "link_thermal"),
-    "adapter droops at the flange": ("mount_droop", "mount_bend", "fixture_droop", "fixture_bend"),
-    "scanner is knocked": ("mount_step",),
-    "field of the scanner is a bowl": ("field_curvature",),
-    "steep surfaces look farther": ("incidence_bias",),
-    "near and far look farther": ("range_nonlinearity",),
 }

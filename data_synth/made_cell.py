@@ -25,6 +25,12 @@ from stitch.system.process import console
 
 Array = NDArray[np.float64]
 Truth = dict[str, Any]
+_LINE = (
+    "stitch calibrate sphere FOLDER/sphere -o FOLDER/hand-eye.json",
+    "stitch fit FOLDER/window.toml -o FOLDER/found-window",
+    "stitch fit FOLDER/body.toml -o FOLDER/found-body",
+    "stitch seam FOLDER/seam.toml -o seam.csv",
+)
 
 
 class Made(NamedTuple):
@@ -113,12 +119,6 @@ def _two_sessions(folder: Path, seed: int) -> Truth:
     return {name: truth_of(measured) for name, measured in days.items()}
 
 
-_LINE = (
-    "stitch calibrate sphere FOLDER/sphere -o FOLDER/hand-eye.json",
-    "stitch fit FOLDER/window.toml -o FOLDER/found-window",
-    "stitch fit FOLDER/body.toml -o FOLDER/found-body",
-    "stitch seam FOLDER/seam.toml -o seam.csv",
-)
 CELLS = {
     "drilling": Made(_drilling, ("stitch drill FOLDER/job.toml --report page.html",)),
     "panel-robots": Made(

@@ -19,6 +19,8 @@ from data_synth.moment import Moment
 
 Array = NDArray[np.float64]
 Parameters = dict[str, float]
+# Always there, each far below what twenty views can show.
+SMALL = {"joint_compliance": 0.04, "gear_harmonic": 0.04, "mount_drift": 0.04, "incidence_bias": 0.05}
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,6 @@ LAWS: dict[str, Law] = {
     "third_harmonic": Law("joints", joints.draw_wave(2.5e-4), joints.wave(3)),
     "covariate_bias": Law("points", points.draw("k", 0.012), points.covariate_bias),
 }
-
-# Always there, each far below what twenty views can show.
-SMALL = {"joint_compliance": 0.04, "gear_harmonic": 0.04, "mount_drift": 0.04, "incidence_bias": 0.05}
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ _PLAN = {
     **dict(zip(("1002", "1003", "1004", "1005"), ((45, 30), (105, 30), (105, -30), (45, -30)), strict=True)),
 }
 NINE = np.array([[x, y] for y in (-12.0, 0.0, 12.0) for x in (-12.0, 0.0, 12.0)])
+# T_tool_flange: the flange's origin lies HEIGHT behind the tool's, with the same axes.
+_LIFT = frames.make(np.eye(3), np.array([0.0, 0.0, -HEIGHT]))
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,3 @@ class DrillingCell:
         position, direction = self.actual[name]
         angle = np.arctan2(np.linalg.norm(np.cross(T[:3, 2], direction)), T[:3, 2] @ direction)
         return float(np.linalg.norm(T[:3, 3] - position)), float(np.degrees(angle))
-
-
-# T_tool_flange: the flange's origin lies HEIGHT behind the tool's, with the same axes.
-_LIFT = frames.make(np.eye(3), np.array([0.0, 0.0, -HEIGHT]))

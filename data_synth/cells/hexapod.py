@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from stitch.numerics import frames
 
 Array = NDArray[np.float64]
+HOME_HEIGHT = 760.0
 
 
 def ring(radius: float, half_gap_deg: float, first_deg: float) -> Array:
@@ -18,7 +19,6 @@ def ring(radius: float, half_gap_deg: float, first_deg: float) -> Array:
 # Neighbouring joints of base and platform belong to one leg.
 BASE = ring(620.0, 48.0, 0.0)
 PLATFORM = ring(330.0, 12.0, 0.0)
-HOME_HEIGHT = 760.0
 
 
 def lengths(T_base_flange: Array, base: Array = BASE, platform: Array = PLATFORM) -> Array:

@@ -11,6 +11,8 @@ import trimesh
 
 from data_synth.shapes import blade, body_side, car_door, drill_plate, panel, spheres
 
+_FORMATS = (".ply", ".stl")
+
 
 class Shape(NamedTuple):
     """A frozen dataclass of parameters and the function that makes a mesh of it."""
@@ -30,8 +32,6 @@ SHAPES: dict[str, Shape] = {
     "drill_plate": Shape(drill_plate.DrillPlate, drill_plate.build),
     "curved_drill_plate": Shape(drill_plate.CurvedDrillPlate, drill_plate.build),
 }
-
-_FORMATS = (".ply", ".stl")
 
 
 def build_shape(name: str, **parameters: Any) -> trimesh.Trimesh:

@@ -12,6 +12,9 @@ from scipy.interpolate import PchipInterpolator
 from data_synth.shapes.solid import circle, extrude, polygon, rounded, slab, to_mesh, union
 
 Array = NDArray[np.float64]
+HANDLE = np.array([0.845, 0.495])  # middle of the recess, in shares of length and height
+_RECESS = np.array([88.0, 38.0])  # its half axes
+_SHOULDER, _SILL = 0.435, 0.16  # heights of the two creases, in shares of the height
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,6 @@ class Pane(CarDoor):
     gap: float = 16.0  # all round, between the opening's edge and the pane's
     flush: float = 0.0  # the pane's outer surface above (+) or below (−) the sheet's
     glass: float = 4.0
-
-
-HANDLE = np.array([0.845, 0.495])  # middle of the recess, in shares of length and height
-_RECESS = np.array([88.0, 38.0])  # its half axes
-_SHOULDER, _SILL = 0.435, 0.16  # heights of the two creases, in shares of the height
 
 
 def build(door: CarDoor = CarDoor()) -> trimesh.Trimesh:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from data_synth.shapes.solid import extrude, polygon, refined, rounded, to_mesh, union, warp
 
 Array = NDArray[np.float64]
+_AXIAL = 4.0  # longest extent along the axis, in facets
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,6 @@ class Panel:
     frame_height: float = 75.0
     sheet: float = 1.8  # of stringers and frames
     facet: float = 10.0  # longest extent of a triangle along the arc
-
-
-_AXIAL = 4.0  # longest extent along the axis, in facets
 
 
 def build(panel: Panel = Panel()) -> trimesh.Trimesh:

@@ -23,6 +23,13 @@ DAY_S = 86400.0
 # Of this century, counted in seconds since 1970.
 EPOCH_S = (0.9e9, 4.0e9)
 DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
+_STAMP = re.compile(
+    r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})[T_\- ]+(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?:[-_.,](\d{3}|\d{6}))?(?!\d)"
+)
+# Seconds since 1970 with a fraction, or milli-, micro- or nanoseconds, as cameras and ROS call their files.
+_SINCE_1970 = re.compile(r"(?<![\d.])(\d{10}(?:[._]\d{1,9})?|\d{13}|\d{16}|\d{19})(?![\d.])")
+# Of the usual time from scan to scan: a pose farther from its scan was not taken with it.
+_NEAR = 0.1
 
 
 @dataclass(frozen=True)
@@ -93,15 +100,6 @@ def _date_ordinal(text: str, day_first: bool) -> int | None:
         with suppress(ValueError):
             return datetime.strptime(re.sub("[./]", "-", text), form).toordinal()
     return None
-
-
-_STAMP = re.compile(
-    r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})[T_\- ]+(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?:[-_.,](\d{3}|\d{6}))?(?!\d)"
-)
-# Seconds since 1970 with a fraction, or milli-, micro- or nanoseconds, as cameras and ROS call their files.
-_SINCE_1970 = re.compile(r"(?<![\d.])(\d{10}(?:[._]\d{1,9})?|\d{13}|\d{16}|\d{19})(?![\d.])")
-# Of the usual time from scan to scan: a pose farther from its scan was not taken with it.
-_NEAR = 0.1
 
 
 def rows_by_time(

@@ -33,6 +33,17 @@ from stitch.system.process import steps
 # Scanner or part sits at the flange if it lies this much nearer to its frame's origin than the other.
 _NEARER = 1.5
 _WORDS = {"eye_in_hand": "the scanner sits at the flange", "eye_to_hand": "the part sits at the flange"}
+# Ways that the dear judge sees: the best of each cheap one.
+_SHORT = 4
+# Motions that closed give a start for the surfaces; and so many of them leave no doubt of a pairing.
+_CLOSED, MOST_CLOSED = 0.5, 0.85
+# Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
+# (see CLEARLY_BETTER) tells it.
+_TWICE, BY_CHANCE = 1.9, 1.12
+# Two rough fits of the same differ by so many milliradians, and millimetres.
+_ROUGH = 5.0
+# A fitted scale belongs to a unit within this factor: 10 and 25.4 lie 2.5 apart.
+_UNIT_FACTOR = 1.5
 
 
 @dataclass(frozen=True)
@@ -131,19 +142,6 @@ def _used_poses(h: Hypothesis) -> Array:
 def _small(off: Array) -> bool:
     """Below a milliradian and a millimetre."""
     return bool(off[:, :3, :3].max() < 1e-3 and off[:, :3, 3].max() < 1.0)
-
-
-# Ways that the dear judge sees: the best of each cheap one.
-_SHORT = 4
-# Motions that closed give a start for the surfaces; and so many of them leave no doubt of a pairing.
-_CLOSED, MOST_CLOSED = 0.5, 0.85
-# Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
-# (see CLEARLY_BETTER) tells it.
-_TWICE, BY_CHANCE = 1.9, 1.12
-# Two rough fits of the same differ by so many milliradians, and millimetres.
-_ROUGH = 5.0
-# A fitted scale belongs to a unit within this factor: 10 and 25.4 lie 2.5 apart.
-_UNIT_FACTOR = 1.5
 
 
 @dataclass(frozen=True)

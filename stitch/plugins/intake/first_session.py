@@ -71,6 +71,17 @@ _POINTS = 8000
 _FEWEST = 3
 # Lists that are tried where the scans contradict the likely one.
 _MOST_LISTS = 4
+# Of the width of a profile: how far its points lie from a plane through the scanner.
+_FLAT = 1e-3
+# Between units that people write; scans of one campaign differ by less, in size and in distance alike.
+_UNIT_STEPS, _ALIKE = np.array([1e3, 25.4, 10.0, 0.1, 1 / 25.4, 1e-3]), 0.25
+# Factors between clouds and robot that a fitted scale is taken for, within this share.
+_ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
+_INCHES = (25.4, 1 / 25.4, 2.54, 1 / 2.54, 0.0254, 1 / 0.0254)
+# Scanners and robots agree within this share; beyond, a unit is wrong.
+_SCALE = 0.05
+# Factors that are none between units are scales up to this.
+_LARGEST = 3.0
 
 
 @dataclass(frozen=True)
@@ -327,10 +338,6 @@ def _unit_of_pairs(guess: Guess, alike: Sequence[tuple[str, str]], stated: State
     )
 
 
-# Of the width of a profile: how far its points lie from a plane through the scanner.
-_FLAT = 1e-3
-
-
 def _is_profile(points: Array) -> bool:
     """Return True of one line of a laser: all points lie in a plane through the scanner's origin."""
     extents = np.linalg.svd(points[:: -(-len(points) // _POINTS)], compute_uv=False)
@@ -398,10 +405,6 @@ def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[i
     return [clouds[k] for k in same], [kept[k] for k in same], [error.what.split("; ")[0] for error in lost]
 
 
-# Between units that people write; scans of one campaign differ by less, in size and in distance alike.
-_UNIT_STEPS, _ALIKE = np.array([1e3, 25.4, 10.0, 0.1, 1 / 25.4, 1e-3]), 0.25
-
-
 def _in_another_unit(files: Sequence[Path], clouds: Sequence[Cloud]) -> dict[int, Refusal]:
     """Return clouds that are so many times as large and as far as the others, each with what is wrong with it."""
     spread = [(np.linalg.norm(np.std(c.points, axis=0)), np.linalg.norm(np.mean(c.points, axis=0))) for c in clouds]
@@ -421,15 +424,6 @@ def _coded(clouds: Sequence[Cloud]) -> list[str]:
     share = coded / (coded + sum(cloud.count for cloud in clouds))
     codes = ", ".join(f"{code:g}" for code in sorted({code for cloud in clouds for code in cloud.codes}))
     return [f"{share:.1%} of the points, which hold {codes}: nothing was measured there"] * (coded > 0)
-
-
-# Factors between clouds and robot that a fitted scale is taken for, within this share.
-_ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
-_INCHES = (25.4, 1 / 25.4, 2.54, 1 / 2.54, 0.0254, 1 / 0.0254)
-# Scanners and robots agree within this share; beyond, a unit is wrong.
-_SCALE = 0.05
-# Factors that are none between units are scales up to this.
-_LARGEST = 3.0
 
 
 def _is_between_units(scale: float) -> bool:

@@ -35,6 +35,24 @@ _RECORDS = (1e-3, 1e6)
 # A recording of a robot is as long as a scan; the names of its columns tell them apart.
 _RECORDINGS = 2
 _RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat", re.IGNORECASE), 4096
+_DEEPEST = 3
+_LARGEST_TABLE_MB = 5.0
+_PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
+# What this program writes itself.
+_OWN = {"session.toml": b"stitch-session", "targets.csv": b"target,"}
+_OWN |= dict.fromkeys(("views.csv", "points.csv", "frames.csv"), b"view,")
+# Robots, pictures and documents.
+_DOCUMENTS = (".md", ".html", ".py")
+_NO_POSES = (".urdf", ".xacro", ".pdf", ".toml", ".mtl", *_DOCUMENTS)
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+# Angles of a turntable in names: scan_020deg, angle_45.5, 120°.
+_ANGLE = re.compile(
+    r"(?:angle|winkel|rot|turn|table|theta|deg)[a-z]*[_-]?([+-]?\d+(?:[.,]\d+)?)"
+    r"|(\d+(?:[.,p]\d+)?)[_ ]?(?:deg|grad|°)",
+    re.IGNORECASE,
+)
+# Tables and descriptions that lie beside such a file are far smaller.
+_SMALL_MB = 5.0
 
 
 def clouds_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -86,18 +104,6 @@ def _is_cloud_array(file: Path) -> bool:
         return False
     image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
     return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
-
-
-_DEEPEST = 3
-_LARGEST_TABLE_MB = 5.0
-_PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
-# What this program writes itself.
-_OWN = {"session.toml": b"stitch-session", "targets.csv": b"target,"}
-_OWN |= dict.fromkeys(("views.csv", "points.csv", "frames.csv"), b"view,")
-# Robots, pictures and documents.
-_DOCUMENTS = (".md", ".html", ".py")
-_NO_POSES = (".urdf", ".xacro", ".pdf", ".toml", ".mtl", *_DOCUMENTS)
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 @dataclass(frozen=True)
@@ -203,14 +209,6 @@ def lens_of(cloud: Path) -> Intrinsics | None:
     return None
 
 
-# Angles of a turntable in names: scan_020deg, angle_45.5, 120°.
-_ANGLE = re.compile(
-    r"(?:angle|winkel|rot|turn|table|theta|deg)[a-z]*[_-]?([+-]?\d+(?:[.,]\d+)?)"
-    r"|(\d+(?:[.,p]\d+)?)[_ ]?(?:deg|grad|°)",
-    re.IGNORECASE,
-)
-
-
 def angles_in_names(clouds: Sequence[Path]) -> list[float] | None:
     """Return the angle in each cloud's name, degrees; None where one has none, or two are alike."""
     found = [_ANGLE.search(cloud.stem) for cloud in clouds]
@@ -298,10 +296,6 @@ def _stated_list(poses: Path, part: str, clouds: set[Path]) -> FoundList:
         raise Refusal(f"{poses}: no files of poses there", named)
     files = tuple(natsorted(inside, alg=ns.IGNORECASE))
     return FoundList(files, read_raw_poses(files), "poses")
-
-
-# Tables and descriptions that lie beside such a file are far smaller.
-_SMALL_MB = 5.0
 
 
 @contextmanager

@@ -21,6 +21,23 @@ _JOINT_WORDS = re.compile(r"joint|shoulder|elbow|wrist|axis_?\d", re.IGNORECASE)
 _FEWEST_JOINTS, _TURN = 5, 2 * np.pi + 1e-3
 # Larger numbers are no angles; with room for what rounding adds to a full turn.
 _DEGREES = 360.5
+_TIMES = re.compile(r"(?:time|time_?stamp|stamp|zeit|t|sec|seconds)(?:_(s|seconds|ms|us|µs|ns|min|h))?")
+_SECONDS = {"s": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+# Names that views.csv keeps for itself.
+_OWN = re.compile(r"view|cloud|time_s|[xyz]|q[xyzw]|j\d+_(deg|approach)")
+# Scans are judged in millimetres.
+MM = 1e-3
+# Metres per unit in which people write poses.
+POSE_UNITS = CLOUD_UNITS = CLOUD_METRES
+# How many times farther from the origin than from each other positions of a site lie.
+_SITE = 100.0
+# Of the flange from the base, metres: from a desktop arm to one on a rail; in units that few robots count in, an
+# arm's own.
+_REACH_M = {"mm": (0.08, 12.0), "m": (0.08, 12.0), "cm": (0.25, 2.5), "inch": (0.25, 2.5)}
+# Longest side of a scan, metres, and its distance from the scanner.
+_SIZE_M, _RANGE_M = (5e-3, 10.0), 12.0
+# Of most arms at work; motions of scans and robot that agree within this share have the same scale.
+_USUAL_REACH_M, _SAME_SCALE = 0.9, 0.05
 
 
 @dataclass(frozen=True)
@@ -249,12 +266,6 @@ def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
     return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]
 
 
-_TIMES = re.compile(r"(?:time|time_?stamp|stamp|zeit|t|sec|seconds)(?:_(s|seconds|ms|us|µs|ns|min|h))?")
-_SECONDS = {"s": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
-# Names that views.csv keeps for itself.
-_OWN = re.compile(r"view|cloud|time_s|[xyz]|q[xyzw]|j\d+_(deg|approach)")
-
-
 def covariate_columns(layout: ColumnLayout, rows: Sequence[int], time_s: Array | None = None) -> dict[str, list[str]]:
     """Cells by name, in the order of `rows`; a time that runs backwards in it and a count of the rows are left out.
 
@@ -303,21 +314,6 @@ def _seconds_per_unit(times: Array, unit: str | None) -> float:
 def _is_row_count(values: Array) -> bool:
     """True of the numbers 0 or 1 to the last, in any order."""
     return len(values) > 2 and bool((np.diff(np.sort(values)) == 1).all()) and values.min() in (0, 1)
-
-
-# Scans are judged in millimetres.
-MM = 1e-3
-# Metres per unit in which people write poses.
-POSE_UNITS = CLOUD_UNITS = CLOUD_METRES
-# How many times farther from the origin than from each other positions of a site lie.
-_SITE = 100.0
-# Of the flange from the base, metres: from a desktop arm to one on a rail; in units that few robots count in, an
-# arm's own.
-_REACH_M = {"mm": (0.08, 12.0), "m": (0.08, 12.0), "cm": (0.25, 2.5), "inch": (0.25, 2.5)}
-# Longest side of a scan, metres, and its distance from the scanner.
-_SIZE_M, _RANGE_M = (5e-3, 10.0), 12.0
-# Of most arms at work; motions of scans and robot that agree within this share have the same scale.
-_USUAL_REACH_M, _SAME_SCALE = 0.9, 0.05
 
 
 def pose_units(position: Array, otherwise: str = "mm") -> list[str]:

@@ -37,6 +37,10 @@ _STATED_UNIT = re.compile(r"units?\W{0,3}(?:of length)?\W{0,3}(millimet|mm|met|m
 _UNIT_WORDS = {"millimet": "mm", "mm": "mm", "met": "m", "m": "m", "inch": "inch"}
 COUNTED = re.compile(r"view|pose|index|idx|id|nr|no|num|number|point|target|meas|frame|config", re.IGNORECASE)
 _MAX_MB = 200
+# Links of a robot add up to more than this in mm, and to less in m.
+_LONGEST_M = 20.0
+# A reading, and the [robot] table by which it is one of joints.
+ReadingOfArm = tuple[Reading, dict[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -173,10 +177,6 @@ def find_geometry(files: Sequence[Path], tables: Sequence[Table]) -> Geometry | 
     return None
 
 
-# Links of a robot add up to more than this in mm, and to less in m.
-_LONGEST_M = 20.0
-
-
 def _arm_of(table: dict[str, Any]) -> tuple[Robot, dict[str, Any]]:
     """The arm of a [robot] table, with the table in mm."""
     table = _in_mm(table)
@@ -197,10 +197,6 @@ def _in_mm(table: dict[str, Any]) -> dict[str, Any]:
 
     payload = {"payload": scaled(table["payload"])} if "payload" in table else {}
     return {**table, "joints": [scaled(row) for row in rows], **payload}
-
-
-# A reading, and the [robot] table by which it is one of joints.
-ReadingOfArm = tuple[Reading, dict[str, Any] | None]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,31 @@ PoseRow = tuple[tuple[str, ...], dict[str, float]]  # texts beside a pose, and i
 
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*|,\d+)?|\.\d+)(?:[eE][+-]?\d+)?"
 _POINTED = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_KEYED = re.compile(
+    rf"(?<![\w.$])(?:([A-Za-z_]+\d)[ \t]*[\s:=][ \t]*|([A-Za-z_]+)[ \t]*[:=]?[ \t]*)({_NUMBER})"
+    r"[ \t]*(mm|cm|m|deg|rad|°)?(?![\w.])"
+)
+_KUKA = re.compile(r"E6POS|E3POS|POS_ACT|\bFRAME\b|KUKA|<RIst\b", re.IGNORECASE)
+_KUKA_AXES = re.compile(r"E6AXIS|AXIS_ACT|<AIPos\b", re.IGNORECASE)
+_ELEMENT = re.compile(r"<([\w:.-]+)((?:\s+[\w:.-]+\s*=\s*[\"'][^\"'<>]*[\"'])+)\s*/?>")
+_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*[\"']([^\"'<>]*)[\"']")
+_TURNS: tuple[tuple[str, ...], ...] = (
+    ("qx", "qy", "qz", "qw"),
+    ("q0", "q1", "q2", "q3"),
+    ("q1", "q2", "q3", "q4"),
+    *(("w", "p", "r"), ("a", "b", "c"), ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("o", "a", "t"), ("u", "v", "w")),
+)
+_JOINTS = [tuple(f"{letter}{i}" for i in range(1, 7)) for letter in "ja"]
+# Angles whose order and unit the format defines: the columns of KUKA's A, B, C and of Kawasaki's O, A, T.
+_DEFINED = {("a", "b", "c"): ("azyx", "bzyx", "czyx"), ("o", "a", "t"): ("ozyz", "azyz", "tzyz")}
+_EXTERNAL = [f"e{i}" for i in range(1, 7)]
+_UR_NAMES = ("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]")
+# Codes of create_pose: order of the rotation by its lower bits, the direction of the transform by the two others.
+_HALCON_ORDERS = {0: "gba", 2: "abg", 4: "rodriguez"}
+_COORDINATE_SYSTEM, _SUBTRACTED = 1, 8
+_FOUR_NUMBERS = rf"[ \t]*\[*[ \t]*{_POINTED}(?:[ \t,;]+{_POINTED}){{3}}[ \t]*\]*[,;]?[ \t]*(?:\r?\n|$)"
+_BLOCK = re.compile(rf"^(?:{_FOUR_NUMBERS}){{4}}", re.MULTILINE)
+_STANFORD = re.compile(r"^bmesh\s+(\S+)" + rf"\s+({_POINTED})" * 7 + r"\s*$", re.MULTILINE)
 
 
 def read_pose_text(text: str) -> dict[str, tuple[list[PoseRow], str]]:
@@ -68,26 +93,6 @@ def _labelled(text: str, spans: Sequence[tuple[int, int]], rows: Iterable[dict[s
     # The word next to a pose is its name: the last before it, the first behind it.
     near = [labels[:width] if behind else labels[len(labels) - width :] for labels in kept]
     return list(zip(near, rows, strict=True))
-
-
-_KEYED = re.compile(
-    rf"(?<![\w.$])(?:([A-Za-z_]+\d)[ \t]*[\s:=][ \t]*|([A-Za-z_]+)[ \t]*[:=]?[ \t]*)({_NUMBER})"
-    r"[ \t]*(mm|cm|m|deg|rad|°)?(?![\w.])"
-)
-_KUKA = re.compile(r"E6POS|E3POS|POS_ACT|\bFRAME\b|KUKA|<RIst\b", re.IGNORECASE)
-_KUKA_AXES = re.compile(r"E6AXIS|AXIS_ACT|<AIPos\b", re.IGNORECASE)
-_ELEMENT = re.compile(r"<([\w:.-]+)((?:\s+[\w:.-]+\s*=\s*[\"'][^\"'<>]*[\"'])+)\s*/?>")
-_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*[\"']([^\"'<>]*)[\"']")
-_TURNS: tuple[tuple[str, ...], ...] = (
-    ("qx", "qy", "qz", "qw"),
-    ("q0", "q1", "q2", "q3"),
-    ("q1", "q2", "q3", "q4"),
-    *(("w", "p", "r"), ("a", "b", "c"), ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("o", "a", "t"), ("u", "v", "w")),
-)
-_JOINTS = [tuple(f"{letter}{i}" for i in range(1, 7)) for letter in "ja"]
-# Angles whose order and unit the format defines: the columns of KUKA's A, B, C and of Kawasaki's O, A, T.
-_DEFINED = {("a", "b", "c"): ("azyx", "bzyx", "czyx"), ("o", "a", "t"): ("ozyz", "azyz", "tzyz")}
-_EXTERNAL = [f"e{i}" for i in range(1, 7)]
 
 
 def _keyed_rows(text: str) -> list[PoseRow]:
@@ -150,7 +155,6 @@ def _tagged_lists(text: str) -> dict[str, list[PoseRow]]:
 
 _ROBTARGET = re.compile(rf"\[\s*{_list_of(3)}\s*,\s*{_list_of(4)}(?:\s*,\s*\[[^\]]*\])*\s*\]?")
 _UR_POSE = re.compile(rf"(?<!\w)p\s*{_list_of(6)}")
-_UR_NAMES = ("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]")
 _TF_ECHO = re.compile(rf"Translation:\s*{_list_of(3)}.*?Quaternion[^\[]*{_list_of(4)}", re.DOTALL)
 
 
@@ -166,11 +170,6 @@ def _matched_rows(pattern: re.Pattern[str], names: Sequence[str], text: str) -> 
     found = list(pattern.finditer(text))
     rows = [dict(zip(names, _floats(m.groups()), strict=True)) for m in found]
     return _labelled(text, [m.span() for m in found], rows) if found else []
-
-
-# Codes of create_pose: order of the rotation by its lower bits, the direction of the transform by the two others.
-_HALCON_ORDERS = {0: "gba", 2: "abg", 4: "rodriguez"}
-_COORDINATE_SYSTEM, _SUBTRACTED = 1, 8
 
 
 def _halcon_rows(text: str) -> list[PoseRow]:
@@ -190,10 +189,6 @@ def _halcon_rows(text: str) -> list[PoseRow]:
         R = Rotation.from_euler("XYZ" if order == "gba" else "xyz", angles, degrees=True).as_matrix()
     T = frames.make(R, -R @ shift if code & _SUBTRACTED else shift)
     return [((), posed(frames.inverse(T) if code & _COORDINATE_SYSTEM else T, "m"))]
-
-
-_FOUR_NUMBERS = rf"[ \t]*\[*[ \t]*{_POINTED}(?:[ \t,;]+{_POINTED}){{3}}[ \t]*\]*[,;]?[ \t]*(?:\r?\n|$)"
-_BLOCK = re.compile(rf"^(?:{_FOUR_NUMBERS}){{4}}", re.MULTILINE)
 
 
 def _matrix_rows(text: str) -> list[PoseRow]:
@@ -222,9 +217,6 @@ def _colmap_rows(text: str) -> list[PoseRow]:
         T = frames.make(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(shift))
         rows.append(((" ".join(words[9:]),), posed(frames.inverse(T))))
     return rows
-
-
-_STANFORD = re.compile(r"^bmesh\s+(\S+)" + rf"\s+({_POINTED})" * 7 + r"\s*$", re.MULTILINE)
 
 
 def _stanford_rows(text: str) -> list[PoseRow]:

@@ -32,6 +32,24 @@ _NUMBER_BEFORE = re.compile(rf"({_DECIMAL})\s*([A-Za-z°].*)")
 _BRACKETS = str.maketrans("[](){}", " " * 6)
 # Rows of a matrix as MATLAB has them: "T1 = [0.36, 0.93, 0.1; 0.2, …];".
 _ROWS = re.compile(r"\[[^\[\]]*\d\.\d[^\[\]]*;[^\[\]]*\]")
+# Line of the file, and its cells.
+NumberedRows = list[tuple[int, list[str]]]
+_SEVERAL = 3
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "spaces"}
+# Lines that are drawn, as below the header of a table in Markdown.
+_RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
+# Between cells, whatever the separator; a row of a pose has so many at least.
+_CELL_END = re.compile(r"\s*[;,=|\t]\s*|\s+")
+_FEWEST_CELLS = 6
+# Lines that tell the separator.
+_SAMPLED = 2000
+# Longer lines are of drawings and documents.
+_LONGEST_LINE = 100_000
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ \u202f\xa0\u2009]\d{3})+[.,]\d+)")
+_COMMENTS = ("#", "%", "//")
+# A row of names that stand over several columns has more empty cells than this leaves.
+_SPARSE = 0.6
+_COORDINATES = {*"xyz", "rx", "ry", "rz", "rotx", "roty", "rotz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
 
 
 def split_cells(line: str, separator: str) -> list[str]:
@@ -66,11 +84,6 @@ def _without_trailing_blanks(cells: list[str]) -> list[str]:
     return cells[: last + 1]
 
 
-# Line of the file, and its cells.
-NumberedRows = list[tuple[int, list[str]]]
-_SEVERAL = 3
-
-
 def _trimmed_rows(rows: NumberedRows) -> NumberedRows:
     """Without empty cells at the end, but for those below a name that only some rows have a remark under."""
     numbered = [cells for _, cells in rows if _number_count(cells) >= _SEVERAL]
@@ -92,23 +105,6 @@ def _trimmed_rows(rows: NumberedRows) -> NumberedRows:
 
 def _number_count(cells: list[str]) -> int:
     return sum(parse_number(cell) is not None for cell in cells)
-
-
-_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "spaces"}
-# Lines that are drawn, as below the header of a table in Markdown.
-_RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
-# Between cells, whatever the separator; a row of a pose has so many at least.
-_CELL_END = re.compile(r"\s*[;,=|\t]\s*|\s+")
-_FEWEST_CELLS = 6
-# Lines that tell the separator.
-_SAMPLED = 2000
-# Longer lines are of drawings and documents.
-_LONGEST_LINE = 100_000
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ \u202f\xa0\u2009]\d{3})+[.,]\d+)")
-_COMMENTS = ("#", "%", "//")
-# A row of names that stand over several columns has more empty cells than this leaves.
-_SPARSE = 0.6
-_COORDINATES = {*"xyz", "rx", "ry", "rz", "rotx", "roty", "rotz", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw"}
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,11 @@ _MIRRORED = (1.0, 1.0, -1.0, -1.0, -1.0, 1.0)
 _ROWS_SHOWN = 3
 # Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
 _FEWEST_WHOLE = 0.6
+# Lines of a record: a rotation and a position, and what stands before or behind them.
+_RECORD_LINES = range(4, 9)
+PROGRAMS = (".ls", ".src", ".mod", ".script")
+_KUKA_DATA = ".dat"
+_LOOKED_AT = 65536
 
 
 @dataclass(frozen=True)
@@ -304,10 +309,6 @@ def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     return None
 
 
-# Lines of a record: a rotation and a position, and what stands before or behind them.
-_RECORD_LINES = range(4, 9)
-
-
 def _records_of_lines(file: Path, text: str) -> RawPoses | None:
     """Return records of three numbers a line, each a row: rotation by rows, position, and others."""
     lines = repeated_records(text)
@@ -409,11 +410,6 @@ def header_poses(clouds: Sequence[Path]) -> RawPoses:
         labels=tuple((cloud.name, *time) for cloud, time in zip(clouds, times, strict=True)),
         words=words,
     )
-
-
-PROGRAMS = (".ls", ".src", ".mod", ".script")
-_KUKA_DATA = ".dat"
-_LOOKED_AT = 65536
 
 
 def is_program(file: Path) -> bool:

@@ -25,6 +25,23 @@ from stitch.screening.hypotheses import ORDERS
 from stitch.session.reading.robot_description import moving_joints, poses_of_urdf
 from stitch.session.robot import Robot, forward
 
+# The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
+_USUAL = ("xyz-extrinsic", "zyx-intrinsic", "xyz-intrinsic", "rotation-vector", "zyz-intrinsic")
+_BY_AXIS = ("XZY", "YXZ", "YZX", "ZXY")
+# Larger numbers are degrees; a rotation vector and Euler angles in radians stay below.
+_RADIANS = 2 * np.pi + 1e-3
+# Readings of an unknown order that are tried with every linear axis; columns that can be one, and that are none.
+_USUAL_AXIS = 5
+_NO_AXIS = re.compile(
+    r"temp|grad|speed|vel|force|torque|current|volt|count|index|time|stamp|sec|nr|\b(no|id)\b|°", re.I
+)
+# Steps of poses and of the arm in the joints beside them turn alike within this, rad.
+_TURNS_ALIKE = 5e-3
+JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"
+_SLID_MM = 20.0  # longer ways of a slide are no metres
+# tool0 and flange are those of ROS-Industrial.
+_FLANGES = ("tool0", "flange", "ee_link", "tcp")
+
 
 @dataclass(frozen=True)
 class StatedTable:
@@ -52,13 +69,6 @@ def require_known_word(flag: str, value: str | None, known: Collection[str]) -> 
     if value is not None and value not in known:
         name = flag.split(",")[0].strip("-").replace("-", "_")
         raise Refusal(f"{flag} {value}:", Fix(f"use {', '.join(known)}", {name: name.upper()}))
-
-
-# The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
-_USUAL = ("xyz-extrinsic", "zyx-intrinsic", "xyz-intrinsic", "rotation-vector", "zyz-intrinsic")
-_BY_AXIS = ("XZY", "YXZ", "YZX", "ZXY")
-# Larger numbers are degrees; a rotation vector and Euler angles in radians stay below.
-_RADIANS = 2 * np.pi + 1e-3
 
 
 @dataclass(frozen=True)
@@ -232,13 +242,6 @@ def left_handed_readings(raw: RawPoses, stated: StatedTable) -> Iterator[Reading
                     yield replace(reading, variant=f"{words} counted the other way round")
 
 
-# Readings of an unknown order that are tried with every linear axis; columns that can be one, and that are none.
-_USUAL_AXIS = 5
-_NO_AXIS = re.compile(
-    r"temp|grad|speed|vel|force|torque|current|volt|count|index|time|stamp|sec|nr|\b(no|id)\b|°", re.I
-)
-
-
 def _on_a_linear_axis(found: Sequence[Reading]) -> Iterator[Reading]:
     """Yield poses with a column beside them added to x, y or z: a rail that carries the robot."""
     for reading in found:
@@ -261,10 +264,6 @@ def _uncoupled(layout: ColumnLayout, urdf: Path, angle_unit: str | None) -> Iter
         joints[:, 2] += sign * joints[:, 1]
         for reading in joint_readings(replace(layout, joints=joints), urdf, angle_unit):
             yield replace(reading, variant=words)
-
-
-# Steps of poses and of the arm in the joints beside them turn alike within this, rad.
-_TURNS_ALIKE = 5e-3
 
 
 def with_uncoupled_joints(reading: Reading, urdf: Path | None) -> Reading:
@@ -294,10 +293,6 @@ def candidate_units(readings: Sequence[Reading], stated: StatedTable, otherwise:
         return [stated.length_unit]
     open_ = [r for r in readings if r.layout.length_unit is None]
     return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3], otherwise))) or ["mm"]
-
-
-JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"
-_SLID_MM = 20.0  # longer ways of a slide are no metres
 
 
 def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: str | None) -> list[Reading]:
@@ -338,10 +333,6 @@ def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: s
         scale = np.where(slides, 1.0 if in_m else 1e-3, 1.0 if unit == "rad" else np.pi / 180)
         out.append(Reading(poses(joints * scale), word, unit, layout, 100 * place))
     return out
-
-
-# tool0 and flange are those of ROS-Industrial.
-_FLANGES = ("tool0", "flange", "ee_link", "tcp")
 
 
 def with_joints_of(raw: RawPoses, urdf: Path) -> RawPoses:

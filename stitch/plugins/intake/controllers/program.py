@@ -18,6 +18,22 @@ from stitch.plugins.intake.controllers.taught_points import TaughtPoint, line_of
 from stitch.session.reading.csv_files import is_number
 
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+PROGRAMS: dict[str, ModuleType] = {
+    ".ls": fanuc,
+    ".dat": kuka,
+    ".src": kuka,
+    ".mod": abb,
+    ".script": universal_robots,
+    ".jbi": yaskawa,
+}
+# Frame and tool of nothing: points taught in them are flange poses in the base.
+NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0", "TOOL 0, BASE", "TOOL 0, ROBOT")
+# No length in mm and no angle of a controller is larger.
+_LARGEST = 1e9
+_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur", yaskawa: "yaskawa"}
+_COMMENTS = {kuka: ";", universal_robots: "#", abb: "!"}
+# Programs are in mm; views.csv is in the session's length_unit.
+_MM_IN_UNIT = {"mm": 1.0, "m": 1e-3}
 
 
 def view_rows(
@@ -63,22 +79,6 @@ def csv_text(rows: Sequence[Sequence[str]]) -> str:
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows(rows)
     return stream.getvalue()
-
-
-PROGRAMS: dict[str, ModuleType] = {
-    ".ls": fanuc,
-    ".dat": kuka,
-    ".src": kuka,
-    ".mod": abb,
-    ".script": universal_robots,
-    ".jbi": yaskawa,
-}
-# Frame and tool of nothing: points taught in them are flange poses in the base.
-NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0", "TOOL 0, BASE", "TOOL 0, ROBOT")
-# No length in mm and no angle of a controller is larger.
-_LARGEST = 1e9
-_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur", yaskawa: "yaskawa"}
-_COMMENTS = {kuka: ";", universal_robots: "#", abb: "!"}
 
 
 @dataclass(frozen=True)
@@ -197,10 +197,6 @@ def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
             "to fix: give points of one frame and tool at a time"
         )
     return told[0].frame if len(told) == len(posed) else ""
-
-
-# Programs are in mm; views.csv is in the session's length_unit.
-_MM_IN_UNIT = {"mm": 1.0, "m": 1e-3}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
@@ -30,6 +29,38 @@ _LARGEST = 3.0
 _POINTS = 3000
 # Points this many robust sigmas off the fitted circle or sphere are of something else.
 _OUTLIER_GATE = 6.0
+# Distances agree within this share, and within so many sigmas.
+_DISTANCE_SHARE, _DISTANCE_SIGMAS = 0.004, 5.0
+# Radii that differ by less belong together.
+_RADIUS_SHARE = 0.04
+# Another way counts as as good if its rms is at most so many times larger.
+_CLEARLY = 3.0
+# Angles of scanner and flange agree within (rad): hundredths of a degree of poses, tenths of balls close together.
+_ANGLE = np.radians(2.0)
+_MIN_COMMON_BALLS = 3
+# Steps of the search for one view: a grid of many balls has more, and its ways are alike anyway.
+_MOST_STEPS = 100_000
+# Radii looked for at one thinning, in its spacing: a cap of 60° then has 30 to 600 points.
+_RADII = (3.0, 14.0)
+# Neighbours that pairs are drawn from, pairs a point, and pairs in all.
+_NEIGHBOURS, _PAIRS, _MOST = 48, 8, 30000
+# Sine of the least angle between normals of a pair; how far its two centres may lie apart, of the radius.
+_MIN_NORMAL_ANGLE, _MIN_PAIR_DISTANCE = 0.3, 0.15
+# Votes lie together within this share of the radius; fewer make no candidate; candidates a thinning.
+_VOTE_RADIUS, _VOTES, _CANDIDATES = 0.1, 8, 12
+_MIN_BALL_POINTS = 60
+# Robust sigma about a ball, of its radius, unless the scan is noisier: then of the noise.
+_ROUND, _NOISES = 0.006, 3.0
+# The cap that must be covered: its half angle, the number of equal cells on the whole sphere, and the share of it that
+# is covered, as well as that of the points in its cone that lie on the ball.
+_CAP, _CELLS, _COVERED = np.radians(35.0), 200, 0.75
+# The same before a fit: within this share of the radius.
+_ROUGHLY, _ROUGHLY_COVERED = 0.06, 0.6
+_THINNEST, _THICKEST = 150, 200_000
+# A radius belongs to the one stated within this share, and within so many sigmas.
+_STATED_RADIUS_SHARE, _STATED_RADIUS_SIGMAS = 0.02, 4.0
+# Radii around the stated ones that are looked at first.
+_AROUND = 1.5
 
 
 @dataclass(frozen=True)
@@ -39,7 +70,7 @@ class Ball:
     centre: Array  # (k,)
     radius: float
     sigma: float  # robust sigma of the distances, length unit
-    keep: NDArray[np.bool_]  # (N,) the points of the circle or sphere
+    keep: Mask  # (N,) the points of the circle or sphere
     covariance: Array  # (k + 1, k + 1) of centre and radius, both free, from the points' sigma
 
 
@@ -115,19 +146,6 @@ def _neighbours(points: Array, size: float, count: int, rng: np.random.Generator
         near = np.flatnonzero(((points - points[trial[0]]) ** 2).sum(axis=1) < size**2)
         trial[1:] = rng.choice(near, count - 1)
     return out
-
-
-# Distances agree within this share, and within so many sigmas.
-_DISTANCE_SHARE, _DISTANCE_SIGMAS = 0.004, 5.0
-# Radii that differ by less belong together.
-_RADIUS_SHARE = 0.04
-# Another way counts as as good if its rms is at most so many times larger.
-_CLEARLY = 3.0
-# Angles of scanner and flange agree within (rad): hundredths of a degree of poses, tenths of balls close together.
-_ANGLE = np.radians(2.0)
-_MIN_COMMON_BALLS = 3
-# Steps of the search for one view: a grid of many balls has more, and its ways are alike anyway.
-_MOST_STEPS = 100_000
 
 
 @dataclass(frozen=True)
@@ -278,25 +296,6 @@ def _extend_arrangement(
     return names, _Arrangement(np.array(places), np.array(classes), (*arrangement.views, (v, T[:3, :3])))
 
 
-# Radii looked for at one thinning, in its spacing: a cap of 60° then has 30 to 600 points.
-_RADII = (3.0, 14.0)
-# Neighbours that pairs are drawn from, pairs a point, and pairs in all.
-_NEIGHBOURS, _PAIRS, _MOST = 48, 8, 30000
-# Sine of the least angle between normals of a pair; how far its two centres may lie apart, of the radius.
-_MIN_NORMAL_ANGLE, _MIN_PAIR_DISTANCE = 0.3, 0.15
-# Votes lie together within this share of the radius; fewer make no candidate; candidates a thinning.
-_VOTE_RADIUS, _VOTES, _CANDIDATES = 0.1, 8, 12
-_MIN_BALL_POINTS = 60
-# Robust sigma about a ball, of its radius, unless the scan is noisier: then of the noise.
-_ROUND, _NOISES = 0.006, 3.0
-# The cap that must be covered: its half angle, the number of equal cells on the whole sphere, and the share of it that
-# is covered, as well as that of the points in its cone that lie on the ball.
-_CAP, _CELLS, _COVERED = np.radians(35.0), 200, 0.75
-# The same before a fit: within this share of the radius.
-_ROUGHLY, _ROUGHLY_COVERED = 0.06, 0.6
-_THINNEST, _THICKEST = 150, 200_000
-
-
 def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> list[Ball]:
     """Find convex balls in a scan (N, 3) seen from the origin, the one with most points first; radii free.
 
@@ -422,12 +421,6 @@ def _even_directions() -> Array:
     z, angle = 1 - 2 * i / _CELLS, np.pi * (1 + np.sqrt(5)) * i
     flat = np.sqrt(1 - z**2)
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
-
-
-# A radius belongs to the one stated within this share, and within so many sigmas.
-_STATED_RADIUS_SHARE, _STATED_RADIUS_SIGMAS = 0.02, 4.0
-# Radii around the stated ones that are looked at first.
-_AROUND = 1.5
 
 
 def ball_sightings(

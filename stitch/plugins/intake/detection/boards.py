@@ -22,6 +22,29 @@ _FORMS = (
 )
 _FAMILIES = ("16h5", "25h9", "36h10", "36h11")
 _LARGEST_MM = 5000.0
+# Fewer corners of a board hold it on nothing.
+_MIN_BOARD_CORNERS = 4
+# Largest half width of the window in which corners are refined, of the distance to the next.
+_REFINED = 0.25
+# Pixels around a corner, and how many must have measured something.
+_MIN_WINDOW, _MAX_WINDOW = 3, 25
+_MIN_WINDOW_PIXELS, _SHARE = 12, 0.3
+# Pixels further off the plane than so many robust sigmas belong to something else.
+_PLANE_GATE = 3.5
+_DRAWS = 40
+# The pixels that are left lie around the point: their middle is this much of the window's radius off at most.
+_MAX_OFFSET_SHARE = 0.5
+# Of the window's size.
+_ROUNDED = 1e-6
+# Half width of the window around a corner, of the distance to the next corner; tags have their border beside them.
+_WINDOW, _WINDOW_OF_TAG = 0.6, 0.3
+# What OpenCV's refined corners scatter by, pixels; the scatter about the board's drawing corrects it.
+_PIXEL_SIGMA = 0.1
+# A scanner's scale is off by less than this; a board that differs more is another one.
+_SCALE_TOLERANCE = 0.03
+# Corners so many sigmas off the drawing are wrong.
+_CORNER_GATE = 5.0
+_MIN_SIGMA_FACTOR = 0.3
 
 
 @dataclass(frozen=True)
@@ -76,12 +99,6 @@ def _length(word: str) -> float:
     if not 0 < length < _LARGEST_MM:
         raise ValueError(word)
     return length
-
-
-# Fewer corners of a board hold it on nothing.
-_MIN_BOARD_CORNERS = 4
-# Largest half width of the window in which corners are refined, of the distance to the next.
-_REFINED = 0.25
 
 
 @dataclass(frozen=True)
@@ -204,18 +221,6 @@ def _tags(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corners]:
     ]
 
 
-# Pixels around a corner, and how many must have measured something.
-_MIN_WINDOW, _MAX_WINDOW = 3, 25
-_MIN_WINDOW_PIXELS, _SHARE = 12, 0.3
-# Pixels further off the plane than so many robust sigmas belong to something else.
-_PLANE_GATE = 3.5
-_DRAWS = 40
-# The pixels that are left lie around the point: their middle is this much of the window's radius off at most.
-_MAX_OFFSET_SHARE = 0.5
-# Of the window's size.
-_ROUNDED = 1e-6
-
-
 def lift_points(image: RangeImage, pixels: Array, radius: Array, pixel_sigma: float) -> tuple[Array, Array]:
     """Return places (K, 3) and sigma of a coordinate (K,) of image points (K, 2); NaN where too little was measured.
 
@@ -287,17 +292,6 @@ def _on_plane(points: Array) -> Mask:
         off_now: Array = np.abs((points - middle) @ normal)
         kept = off_now <= _PLANE_GATE * MAD_TO_SIGMA * np.median(off_now[kept]) + floor
     return np.asarray(kept, bool)
-
-
-# Half width of the window around a corner, of the distance to the next corner; tags have their border beside them.
-_WINDOW, _WINDOW_OF_TAG = 0.6, 0.3
-# What OpenCV's refined corners scatter by, pixels; the scatter about the board's drawing corrects it.
-_PIXEL_SIGMA = 0.1
-# A scanner's scale is off by less than this; a board that differs more is another one.
-_SCALE_TOLERANCE = 0.03
-# Corners so many sigmas off the drawing are wrong.
-_CORNER_GATE = 5.0
-_MIN_SIGMA_FACTOR = 0.3
 
 
 @dataclass(frozen=True)
