@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+# Plane waves that a smooth error of a single scan is the sum of.
+_WAVES = 120
 
 
 @dataclass(frozen=True)
@@ -67,17 +69,15 @@ def field_map(scanner: Scanner, rng: np.random.Generator) -> Array:
     return np.asarray(weights * scanner.field_error / max(scale, 1e-12))
 
 
-def scan_waves(scanner: Scanner, directions: Array, rng: np.random.Generator, waves: int = 120) -> Array:
+def scan_waves(scanner: Scanner, directions: Array, rng: np.random.Generator) -> Array:
     """(N,) one draw of the smooth error of a single scan at directions (N, 3) with z = 1, rms `scan_error`.
 
     A sum of plane waves over the field whose lengths are normal: its correlation falls like a normal density.
     """
     width = 2 * half_field(scanner)[0] * scanner.scan_error_length
-    numbers = rng.standard_normal((waves, 2)) / width
-    phase = rng.uniform(0, 2 * np.pi, waves)
-    return np.asarray(
-        scanner.scan_error * np.sqrt(2 / waves) * np.cos(directions[:, :2] @ numbers.T + phase).sum(axis=1)
-    )
+    numbers = rng.standard_normal((_WAVES, 2)) / width
+    phase = rng.uniform(0, 2 * np.pi, _WAVES)
+    return scanner.scan_error * np.sqrt(2 / _WAVES) * np.cos(directions[:, :2] @ numbers.T + phase).sum(axis=1)
 
 
 def profile_times(scanner: Scanner) -> Array:

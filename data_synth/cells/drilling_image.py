@@ -6,14 +6,15 @@ from data_synth.cells.drilling import FOCAL, HEIGHT, HOLE_DIAMETER, IMAGE, NINE,
 from stitch.numerics import frames
 
 _FINE = 4  # rays per pixel and direction
+_NOISE = 2.0  # grey levels
 
 
-def render_plate(cell: DrillingCell, noise: float = 2.0) -> np.ndarray:
+def render_plate(cell: DrillingCell) -> np.ndarray:
     """Image (2050, 2448) of 8 bits: bright plate, uneven light, nine dark holes, a dark bar that is no hole."""
-    return render_holes(cell, NINE, HEIGHT + cell.sizes.plate_height, noise)
+    return render_holes(cell, NINE, HEIGHT + cell.sizes.plate_height)
 
 
-def render_holes(cell: DrillingCell, centres: np.ndarray, height: float, noise: float = 2.0) -> np.ndarray:
+def render_holes(cell: DrillingCell, centres: np.ndarray, height: float) -> np.ndarray:
     """Image of holes at x, y (N, 2) of a plane at one height of the flange frame."""
     v, u = np.mgrid[: IMAGE[1], : IMAGE[0]]
     image = 190 + 20 * (u / IMAGE[0] - 0.5) - 15 * (v / IMAGE[1] - 0.5)
@@ -23,7 +24,7 @@ def render_holes(cell: DrillingCell, centres: np.ndarray, height: float, noise: 
         rows, columns = (slice(at[axis] - 90, at[axis] + 90) for axis in (1, 0))
         covered = _covered(cell, rows, columns, centre, height)
         image[rows, columns] += (35 - image[rows, columns]) * covered
-    image += cell.rng.normal(0, noise, image.shape)
+    image += cell.rng.normal(0, _NOISE, image.shape)
     return np.clip(image.round(), 0, 255).astype(np.uint8)
 
 

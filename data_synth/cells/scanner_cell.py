@@ -129,8 +129,8 @@ def _towards(aim: Array, away: Array, rng: np.random.Generator) -> Array:
     return pose_of(R, aim + away * 420.0 * rng.uniform(0.95, 1.05))
 
 
-def write_scanners(folder: Path, cell: ScannerCell, stated: bool = True) -> list[Path]:
-    """Write a session folder a scanner, and return them; `stated`: with coarse hand-eyes."""
+def write_scanners(folder: Path, cell: ScannerCell) -> list[Path]:
+    """Write a session folder a scanner, with a coarse hand-eye, and return them."""
     paths = []
     for k, scanner in enumerate(NAMES):
         names = [f"v{v:03d}" for v in range(len(cell.clouds[k]))]
@@ -142,7 +142,7 @@ def write_scanners(folder: Path, cell: ScannerCell, stated: bool = True) -> list
             length_unit="mm",
             mount="eye_to_hand" if cell.kind == "stands" else "eye_in_hand",
             views=columns,
-            tables={"scanner": table | ({"pose": cell.coarse[k].tolist()} if stated else {})},
+            tables={"scanner": table | {"pose": cell.coarse[k].tolist()}},
             clouds={f"clouds/{n}.ply": cloud_file(cloud) for n, cloud in zip(names, cell.clouds[k], strict=True)},
         )
         paths.append(folder / f"cell-{scanner}")

@@ -36,6 +36,7 @@ _EFFECT_P_LIMIT = 1e-3
 # With half a dozen reference holes a smaller limit would hide tilts of a degree.
 _TILT_P_LIMIT = 0.01
 _MIN_HOLES = 4
+_MIN_HOLE_WIDTH = 20.0  # pixels
 
 
 def base_frame(joint6_path: Array, joint1_path: Array, height_joint6: float = 0.0) -> Array:
@@ -383,8 +384,8 @@ def _read_picture(file: Path) -> NDArray[np.uint8]:
     return np.asarray(picture, np.uint8)
 
 
-def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
-    """Return centres (N, 2) in pixels of the dark, nearly elliptic spots wider than `min_width`.
+def find_holes(image: NDArray[np.uint8]) -> Array:
+    """Return centres (N, 2) in pixels of the dark, nearly elliptic spots wider than 20 pixels.
 
     (0, 0) is a pixel's middle. A spot's centre is the grey-weighted mean over its surroundings, so that partly covered
     edge pixels count.
@@ -406,23 +407,22 @@ def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
         _, (a, b), _ = cv2.fitEllipse(contour)
         area = cv2.contourArea(contour)
         # Scratches and letters fill their ellipse badly; a hole fills it to a few per cent.
-        if min(a, b) >= min_width and abs(area / (np.pi * a * b / 4) - 1) <= 0.1:
+        if min(a, b) >= _MIN_HOLE_WIDTH and abs(area / (np.pi * a * b / 4) - 1) <= 0.1:
             centres.append(_centroid(image, cv2.boundingRect(contour)))
     return np.array(centres, float).reshape(-1, 2)
 
 
-def order_grid(centres: Array, rows: int = 3, columns: int = 3) -> Array:
-    """Return centres of a hole array (rows·columns, 2), sorted by rows from the top and by columns from the left.
+def order_grid(centres: Array) -> Array:
+    """Return centres (9, 2) of a plate of 3 × 3 holes, sorted by rows from the top and by columns from the left.
 
     Raises:
         NoResultError: another number of holes.
     """
-    if len(centres) != rows * columns:
+    if len(centres) != 9:
         raise NoResultError(
-            f"{len(centres)} holes found, {rows * columns} expected; to fix: light the plate evenly and keep it in the "
-            "picture"
+            f"{len(centres)} holes found, 9 expected; to fix: light the plate evenly and keep it in the picture"
         )
-    by_row = centres[np.argsort(centres[:, 1])].reshape(rows, columns, 2)
+    by_row = centres[np.argsort(centres[:, 1])].reshape(3, 3, 2)
     return np.concatenate([row[np.argsort(row[:, 0])] for row in by_row])
 
 

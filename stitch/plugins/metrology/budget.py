@@ -321,11 +321,9 @@ class MonteCarlo:
     ratio: Array  # (Q,) of their standard deviation over u by the slopes; its own standard deviation is 1/√(2 · trials)
 
 
-def monte_carlo(
-    places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature], trials: int, seed: int = 0
-) -> MonteCarlo:
+def monte_carlo(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature], trials: int) -> MonteCarlo:
     """Return what trials say of the numbers of some fits; nothing of the slopes of the fits is used."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     thin = [fit.thinned(_TRIAL_POINTS) for fit in fits]
     linear = evaluate(places, wanted, thin)
     modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in _not_stated(places, wanted)]

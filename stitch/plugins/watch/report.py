@@ -37,7 +37,7 @@ _FOLLOWS_P_LIMIT = 1e-4
 # Expanded uncertainty: within which a calibration claims to be right.
 _COVERAGE_FACTOR = 2.0
 # Sessions that a page shows: a month of 20 a day.
-MAX_SESSIONS = 600
+_MOST_SESSIONS = 600
 # Steps of several parameters that begin within so many seconds are one event.
 _TOGETHER = 24 * 3600.0
 # Sessions that scatter by more than so many stated sigmas are remarked.
@@ -369,16 +369,16 @@ class CellTrend:
     channels: dict[str, Array]  # (n,) NaN where a session does not tell
 
 
-def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SESSIONS) -> CellTrend:
+def cell_trend(history: History, report: CellReport) -> CellTrend:
     """The last sessions of a cell, smoothed."""
-    rows = history.sql("SELECT time FROM runs ORDER BY time DESC, id DESC LIMIT ?", max_sessions)
+    rows = history.sql("SELECT time FROM runs ORDER BY time DESC, id DESC LIMIT ?", _MOST_SESSIONS)
     kept = last_state(history, before=rows[-1][0])
     sessions = sessions_after(history, kept)
     moved = defaultdict(list)
     for alarm in stored_alarms(history):
         moved[alarm.onset].append(alarm.parameter)
     smoothed, own_sigmas = smoothed_states(kept, sessions, moved, last_state(history))
-    part = slice(max(len(sessions.ids) - max_sessions, 0), None)
+    part = slice(max(len(sessions.ids) - _MOST_SESSIONS, 0), None)
     common = np.array([p.common_sigma for p in report.parameters])
     times = dict(history.sql("SELECT id, time FROM runs"))
     place = {run: k for k, run in enumerate(sessions.ids[part])}

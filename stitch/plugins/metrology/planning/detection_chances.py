@@ -44,7 +44,7 @@ from stitch.system.process import steps
 
 # Combinations that views see less than this share of a sigma, at plausible size, count in no p-value.
 _MIN_INFORMATION = 1e-2
-DRAWS = 100
+_DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -256,9 +256,9 @@ def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     return bool((np.linalg.norm(white, axis=0) > limits.SEEN_SIGMAS).any())
 
 
-def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DRAWS) -> Array:
+def usual_shifts(candidate: Candidate, rng: np.random.Generator) -> Array:
     """(n, D) what an effect of usual size does: each parameter of a form that is drawn, as large as is plausible."""
-    chosen = [candidate.forms[k] for k in rng.choice(len(candidate.forms), draws, p=form_weights(candidate))]
+    chosen = [candidate.forms[k] for k in rng.choice(len(candidate.forms), _DRAWS, p=form_weights(candidate))]
     return np.array([f.columns @ (f.sizes * rng.choice([-1.0, 1.0], len(f.sizes))) for f in chosen]).T
 
 
