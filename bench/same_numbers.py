@@ -141,7 +141,7 @@ run data/reghec/david -o runs/david --no-recording
 """
 # The same from Python, of clouds and poses in memory.
 _PYTHON = """
-import csv, numpy, trimesh, stitch
+import csv, numpy, plyfile, stitch
 from scipy.spatial.transform import Rotation
 rows = list(csv.DictReader(open("table/views.csv")))
 read = lambda file: plyfile.PlyData.read(file)["vertex"]
