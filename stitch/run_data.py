@@ -1,4 +1,4 @@
-"""What a run computed, as plain frozen data; `writing` puts it on disk."""
+"""What a run computed, as plain frozen data; `output` puts it on disk."""
 
 import re
 from collections.abc import Callable
@@ -10,16 +10,18 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from stitch.model.axis_places import AxisPlace, axis_places
+from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, Term
 from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
 from stitch.observations.scanner_places import ScannerAlone, ScannerPlace, scanner_places
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
-from stitch.observations.surfaces.normal_equations import Overlaps
+from stitch.observations.surfaces.normal_equations import Overlaps, collect_overlaps
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
+from stitch.system.threads import library_threads_off
 from stitch.system.values import Table, Value
 
 Passed = TypeVar("Passed")
@@ -317,10 +319,16 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
         """Where several scanners stand, with U; none of one."""
         return scanner_places(self.measurement, self.model, self.alone)
 
-    @property
+    @cached_property
     def overlaps(self) -> Overlaps | None:
-        """Correspondences under the model, before register moves single views; None of labelled points alone."""
-        return self.fit.overlaps
+        """Correspondences under the model, before register moves single views; None of labelled points alone.
+
+        Those of a run that was read from its folder are searched when they are asked for.
+        """
+        if self.fit.overlaps is not None or not self.session.has_clouds:
+            return self.fit.overlaps
+        with library_threads_off():
+            return collect_overlaps(corrected_capture(self.measurement, self.model), self.poses_model, self.gate)
 
     @property
     def registered(self) -> Overlaps | None:

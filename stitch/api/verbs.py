@@ -18,8 +18,6 @@ from stitch.api.session import Session, public_session
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
 from stitch.effects.contract import find_effect
 from stitch.errors import InputError
-from stitch.fit.correct import gate_of_model
-from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.output import stored_run
 from stitch.output.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
@@ -31,7 +29,6 @@ from stitch.run_data import FusedCloud, RunData
 from stitch.session.scanners import have_own_hand_eyes
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
-from stitch.system.threads import library_threads_off
 
 Register = Literal["dpwvm", "gicp", "vmm"]
 
@@ -166,7 +163,7 @@ def diagnose(run: RunData) -> Diagnosis:
         >>> found.verdict in ("adequate", "missing_effect", "cannot_tell", "unknown_effect")
         True
     """
-    return pipeline.diagnose(stored_state(run))
+    return pipeline.diagnose(run)
 
 
 def add(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -226,8 +223,7 @@ def compare(run: RunData) -> ResidualTables:
         >>> found.rms > 0, len(found.table("view").label)
         (True, 5)
     """
-    state = stored_state(run)
-    return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
+    return compare_surfaces(run) if run.measurement.capture.scans else compare_targets(run)
 
 
 def next_view(run: RunData | Diagnosis) -> tuple[Proposal, ...]:
@@ -294,15 +290,6 @@ def report(
     return page
 
 
-def stored_state(run: RunData) -> RunData:
-    """Return the run as a command would read it from its folder, so that both compute the same numbers.
-
-    The gate, the largest distance between partners in an overlap, is that of the model, as where a folder is read.
-    """
-    with library_threads_off():
-        return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
-
-
 def stored_cloud(run: RunData) -> FusedCloud:
     """Return the stitched cloud rounded as stitched.ply keeps it, to single precision; arrays of float64 again."""
     names = ("points", "normals", "residual")
@@ -350,4 +337,4 @@ def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) ->
     """Return the run fitted again with exactly these effects; `recorder` is told of every stage."""
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return public_run(pipeline.change(stored_state(run), effects, replay), whole_session, replay)
+    return public_run(pipeline.change(run, effects, replay), whole_session, replay)

@@ -294,7 +294,7 @@ def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
 
 def _has_labelled_alone(run: RunData) -> bool:
     """Return whether the rms of the run is that of labelled points; beside clouds it is that of the surfaces."""
-    return run.targets is not None and run.overlaps is None
+    return run.targets is not None and not run.session.has_clouds
 
 
 def _all_views(run: RunData) -> list[ViewRow]:
@@ -574,6 +574,7 @@ RESULT = Document(
     Key("residual_rms", NUMBER, of=RunData),
     Key("heldout_rms", NUMBER_OR_NULL, of=RunData),
     Key("noise_floor", NUMBER, of=RunData),
+    Key("gate", NUMBER_OR_NULL, of=RunData, optional=True),
     Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
     Key("effects", _EFFECTS, "terms"),
     Key("effects_covariance", _COVARIANCE.kind(), "model.effects_covariance", optional=True),

@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.effects.user_file import load
 from stitch.errors import InputError
-from stitch.fit.correct import converged_overlaps, gate_of_model
+from stitch.fit.correct import gate_of_model
 from stitch.fit.target_fit import evaluate_targets
 from stitch.model.forward import corrected_capture
 from stitch.model.model import EffectsCovariance
@@ -128,25 +128,27 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     whole_session = _session_of_run(folder, document, file)
     left_out = results.excluded_views(document)
     session = whole_session.without([item.view for item in left_out])
-    # The order is that of a run: views, model, points that count, gate, stock. Each needs those before it.
+    # The order is that of a run: views, model, points that count, stock. Each needs those before it.
     with library_threads_off():
         whole = with_part_origin(measurement_of(whole_session, prepare_capture(whole_session)), file.T_mount_coarse)
         measurement = whole.without([v for v, name in enumerate(whole_session.names) if name not in session.names])
         model = bind_to_session(file, measurement)
         measurement = results.restore_counted_targets(measurement, session, document)
-        capture = corrected_capture(measurement, model)
-        gate = gate_of_model(capture, model.T_mount)
-        if stock := results.stock_of_views(document, session.names):
+        fields = results.RESULT.fields(document, RunData)
+        stock = results.stock_of_views(document, session.names)
+        if "gate" not in fields:
+            # Earlier versions did not write it.
+            fields["gate"] = gate_of_model(corrected_capture(measurement, model), model.T_mount)
+        if stock:
             # The result states thickness and sigma of the stock; its points are found again.
-            stock = locate_stock(session, capture, model.T_mount, gate, stock)
+            capture = corrected_capture(measurement, model)
+            stock = locate_stock(session, capture, model.T_mount, fields["gate"], stock)
             measurement = replace(measurement, capture=measurement.capture.without_stock(stock))
-            gate = gate_of_model(capture.without_stock(stock), model.T_mount)
     return RunData(
         session=session,
         measurement=measurement,
         model=model,
         T_mount_coarse=file.T_mount_coarse,
-        gate=gate,
         source=partial(_read_fit, folder),
         ledger=steps,
         effects_file=effects,
@@ -154,7 +156,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         tried={row["effect"]: row["dropped"] for row in _whole_diagnosis(folder).get("tried", ())},
         register_method=results.register_method(document),
         alone=results.scanners_alone(document),
-        **results.RESULT.fields(document, RunData),
+        **fields,
     )
 
 
@@ -286,11 +288,10 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
     """
     views = _fused_views(document, run)
     poses = np.array([row.pose for row in views])
-    overlaps = registered = targets = None
+    registered = targets = None
     with library_threads_off():
         capture = corrected_capture(run.measurement, run.model)
         if capture.scans:
-            overlaps = converged_overlaps(capture, run.model.T_mount, run.gate)
             # Of register, where the result states it.
             gate = (document.get("disagreement") or {}).get("gate") or run.gate
             registered = collect_overlaps(capture, poses, gate)
@@ -302,7 +303,6 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
         corrections=np.array([row.correction for row in views]),
         view_rms=np.array([row.rms for row in views]),
         fused=fused_cloud(folder / "stitched.ply"),
-        overlaps=overlaps,
         registered=registered,
         targets=targets,
         **results.RESULT.fields(document, Fit),

@@ -1,6 +1,5 @@
 """`stitch.explain`: what `stitch explain` does, of a run in memory."""
 
-from stitch.api.verbs import stored_state
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError
 from stitch.plugins.explain import explain as explanation
@@ -22,10 +21,9 @@ def explain(run: RunData) -> Explanation:
         >>> stitch.explain(run).found
         False
     """
-    state = stored_state(run)
-    if EFFECT_NAME in state.model.effects:
+    if EFFECT_NAME in run.model.effects:
         raise InputError(
-            f"{state.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its "
+            f"{run.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its "
             "file, and add that"
         )
-    return explanation.explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
+    return explanation.explain(linear_model_of(run), f"Found by `stitch explain` in {run.session.name}.")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from stitch.api.verbs import run as run_session
-from stitch.api.verbs import stored_cloud, stored_state
+from stitch.api.verbs import stored_cloud
 from stitch.errors import NoResultError, NothingMeasuredError
 from stitch.model.model import displacement
 from stitch.numerics.frames import Array
@@ -138,7 +138,7 @@ class DrivenCell:
             planned = cell_of_session(session, self.part, self.size, self.field)
         else:
             cloud = stored_cloud(run)
-            planned = cell_of_state(stored_state(run), cloud.points, cloud.normals)
+            planned = cell_of_state(run, cloud.points, cloud.normals)
         return best_further_view(session if run is None else run.session, planned, refused)
 
 

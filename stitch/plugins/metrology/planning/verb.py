@@ -6,7 +6,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from stitch.api.verbs import stored_cloud, stored_state
+from stitch.api.verbs import stored_cloud
 from stitch.errors import InputError
 from stitch.model.model import expanded_uncertainty
 from stitch.numerics.frames import Array
@@ -110,7 +110,7 @@ def _cell_of_run(run: RunData) -> PlannedCell:
     if not run.session.has_clouds:
         raise InputError(f"{run.session.name}: a run of labelled points; plans are made for scans; to fix: diagnose it")
     cloud = stored_cloud(run)
-    return cell_of_state(stored_state(run), cloud.points, cloud.normals)
+    return cell_of_state(run, cloud.points, cloud.normals)
 
 
 def plan_document(plan: Plan, T_mount: Array) -> dict[str, Any]:
