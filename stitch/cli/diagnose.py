@@ -78,12 +78,17 @@ def _diagnose_together(runs: Sequence[Path], effects_file: Path | None, trust: b
 def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:
     """Return the diagnosis of a run folder and diagnosis.json as a dictionary, after writing it there."""
     from stitch.api.pipeline import diagnose
+    from stitch.output.comparison.model_history import model_history
     from stitch.output.run_folder import preload_entry_points
+    from stitch.system.threads import begin
 
+    preload_entry_points("stitch.diagnosis_reports")
     with opened_run(run, effects_file, trust, "diagnosing: reading the scans") as state:
-        preload_entry_points("stitch.diagnosis_reports")
+        # For the page: matched anew, beside the diagnosis.
+        history = begin(partial(model_history, state))
         with show_activity("diagnosing: trying every effect"):
             diagnosis = diagnose(state)
+        history.result()
         return diagnosis, write_diagnosis(diagnosis, state, run)
 
 

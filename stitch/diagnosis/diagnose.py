@@ -1,13 +1,19 @@
 """The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.dependence import dependences
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.evidence import find_scanner_error, gather_evidence, overlap_misfit_beyond_noise
+from stitch.diagnosis.evidence import (
+    find_scanner_error,
+    gather_evidence,
+    lone_scanner_error,
+    overlap_misfit_beyond_noise,
+)
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, rank_one, too_large
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import follows_field, variance_budget
@@ -32,7 +38,7 @@ from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData
 from stitch.system.process import announce
-from stitch.system.threads import library_threads_off, parallel, return_large_arrays
+from stitch.system.threads import begin, library_threads_off, parallel, return_large_arrays
 
 
 def diagnose_state(state: RunData) -> Diagnosis:
@@ -60,16 +66,20 @@ def _diagnose(state: RunData) -> Diagnosis:
     """
     announce("diagnosing: what every view tells of its pose")
     linear = linear_model_of(state)
+    # Sums over all points, which leave the interpreter to the questions that come before theirs.
+    begin(partial(lone_scanner_error, linear))
     limit = scatter_limit(state.session)
     announce("diagnosing: trying every effect")
     candidates, missing = candidates_of(linear)
     misfit = overlap_misfit_beyond_noise(linear, state.session.scanner.noise)
     evidence = gather_evidence(linear, candidates, limit, misfit)
-    matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
-    examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates))
     announce("diagnosing: errors without a name, and where the error comes from")
     is_unknown = evidence.verdict == "unknown_effect"
     repeating, with_reported, process, scatter = _errors_without_a_name(linear, evidence)
+    # Decompositions of matrices, beside the candidates.
+    budget = begin(partial(variance_budget, with_reported, [r.score for r in evidence.named[:1]], process))
+    matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
+    examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates))
     rotation, translation = np.sqrt(scatter).tolist()
     diagnosis = Diagnosis(
         verdict=evidence.verdict,
@@ -106,7 +116,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         beyond_belief=too_large(evidence.named),
         together=_named_together(evidence),
         tried=state.tried,
-        budget=variance_budget(with_reported, [r.score for r in evidence.named[:1]], process),
+        budget=budget.result(),
         answers=evidence.answers,
     )
     sentence = diagnosis_sentence(diagnosis, state.session.length_unit, _pair_beside_each_other(linear, evidence))

@@ -45,6 +45,7 @@ from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views
+from stitch.system.threads import remembered
 
 # The effect of the direction from which a joint comes.
 _BY_DIRECTION = "backlash"
@@ -341,6 +342,16 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
     Args:
         other_terms: effects of points, fitted beside the error with any size.
     """
+    return _unusual_field_error(linear, other_terms) if other_terms else lone_scanner_error(linear)
+
+
+@remembered
+def lone_scanner_error(linear: LinearModel) -> FieldError | None:
+    """Return `find_scanner_error` without further effects: kept, since several questions ask for it."""
+    return _unusual_field_error(linear, ())
+
+
+def _unusual_field_error(linear: LinearModel, other_terms: Sequence[Term]) -> FieldError | None:
     surfaces = surfaces_of(linear)
     if surfaces is None:
         return None

@@ -72,7 +72,7 @@ def variance_budget(
     surfaces = surfaces_of(linear)
     if linear.mixed.fixed is not None and surfaces is not None:
         # The model holds the scanner's smooth errors at a cautious size; here they have that which the overlaps show.
-        field = linear.reduce(field_scatter(linear.measurement, surfaces.unconstrained, share=None))
+        field = linear.reduce(field_scatter(surfaces.scanner_errors, surfaces.unconstrained, share=None))
         linear = replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
     hand_eye = linear.reduce(linear.design[:, :6])
     terms = [term for term in linear.model.terms if not term.is_geometry]

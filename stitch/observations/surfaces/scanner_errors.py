@@ -80,25 +80,34 @@ def rig_scanner_errors(
     """
     sessions = list(zip(measurements, unconstrained, strict=True))
     return {
-        SCANNER_FIELD: [field_scatter(m, f, None) for m, f in sessions],
+        SCANNER_FIELD: [field_scatter(smooth_errors(m, f), f, None) for m, f in sessions],
         SCANNER_SCALE: [scale_scatter(m, f) for m, f in sessions],
     }
 
 
+def smooth_errors(measurement: Measurement, unconstrained: UnconstrainedPoses) -> list[tuple[PointGram, float]]:
+    """Return for each scanner the sums over pairs for its smooth errors, and its noise (`sum_smooth_errors`).
+
+    The errors are along the ray, over the field and over incidence, alike in all views of a scanner.
+    """
+    masks = measurement.views.scanners.masks(measurement.views.count)
+    return [sum_smooth_errors(measurement, unconstrained, views=views) for views in masks]
+
+
 def field_scatter(
-    measurement: Measurement, unconstrained: UnconstrainedPoses, share: float | None = ALARM_SHARE
+    errors: Sequence[tuple[PointGram, float]], unconstrained: UnconstrainedPoses, share: float | None = ALARM_SHARE
 ) -> Array:
     """Return left twists (6V, K) that the views show for one standard deviation of each of K smooth errors.
 
-    The errors are independent, along the ray, over the field and over incidence, alike in all views of a scanner.
-    Several scanners have K columns together, each its own; zeros where the scans are too few for a noise.
+    The errors are independent. Several scanners have K columns together, each its own; zeros where the scans are too
+    few for a noise.
 
     Args:
+        errors: of each scanner, from `smooth_errors`.
         share: rms of the errors as a share of the scanner's noise; None: estimated from the overlaps.
     """
     columns = []
-    for views in measurement.views.scanners.masks(measurement.views.count):
-        sums, noise = sum_smooth_errors(measurement, unconstrained, views=views)
+    for sums, noise in errors:
         twists = apparent_twists(sums, unconstrained)
         if not np.isfinite(noise):
             sizes = np.zeros(twists.shape[1])

@@ -27,7 +27,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
     reduce_poses,
 )
 from stitch.observations.surfaces.normal_equations import pair_squares
-from stitch.observations.surfaces.scanner_errors import field_scatter, scale_scatter
+from stitch.observations.surfaces.scanner_errors import field_scatter, scale_scatter, smooth_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
@@ -127,6 +127,7 @@ class SurfaceObservation(Observation):
     unconstrained: UnconstrainedPoses
     reduced_poses: ReducedPoses
     centre: Array  # (3,) of the overlaps, reference frame
+    scanner_errors: list[tuple[PointGram, float]]  # a scanner each, of `smooth_errors`
 
     @property
     def reach(self) -> float:
@@ -205,7 +206,8 @@ def surface_model(
     twists = view_columns(measurement, model, unconstrained)
     effects = reduced.reduction @ twists
     sizes, values = sizes_of(model.terms), values_of(model.terms)
-    scanner_covariance = _scanner_covariance(measurement, unconstrained, reduced)
+    scanner_errors = smooth_errors(measurement, unconstrained)
+    scanner_covariance = _scanner_covariance(measurement, unconstrained, reduced, scanner_errors)
     # Which parameters in use the views show at all, under scatter, noise and the scanner's own errors.
     hand_eye_alone = replace(hand_eye_mixed_model(reduced), fixed=scanner_covariance)
     root = np.linalg.cholesky(hand_eye_alone.covariance(fit_null(hand_eye_alone).variances)[0])
@@ -220,7 +222,7 @@ def surface_model(
     return LinearModel(
         measurement,
         model,
-        SurfaceObservation(capture, unconstrained, reduced, gram.centre),
+        SurfaceObservation(capture, unconstrained, reduced, gram.centre, scanner_errors),
         design=np.hstack([hand_eye_jacobian(capture, model.T_mount, gram.centre), twists[:, seen]]),
         sizes=np.append(np.full(6, np.inf), sizes[seen]),
         values=np.append(np.zeros(6), values[seen]),
@@ -231,12 +233,20 @@ def surface_model(
     )
 
 
-def _scanner_covariance(measurement: Measurement, unconstrained: UnconstrainedPoses, reduced: ReducedPoses) -> Array:
+def _scanner_covariance(
+    measurement: Measurement,
+    unconstrained: UnconstrainedPoses,
+    reduced: ReducedPoses,
+    scanner_errors: Sequence[tuple[PointGram, float]],
+) -> Array:
     """Return the covariance (1, n, n) of the reduced poses by the smooth errors that every scanner has.
 
     With several scanners, by errors of their scales too.
+
+    Args:
+        scanner_errors: of each scanner, from `smooth_errors`.
     """
-    errors = [field_scatter(measurement, unconstrained)]
+    errors = [field_scatter(scanner_errors, unconstrained)]
     if measurement.views.scanners:
         # Every pair of scanners differs in scale, and overlaps of their scans show it.
         errors.append(scale_scatter(measurement, unconstrained))

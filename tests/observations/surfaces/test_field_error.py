@@ -390,7 +390,8 @@ def test_what_incidence_shows_is_not_laid_on_the_field():
     scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
     measured = simulated(replace(scene, scanner=scanner), {}, 3, views=10)
     linear = linear_model_of(pipeline.run(session_of(measured)))
-    shown, unit = (field_scatter(linear.measurement, linear.observation.unconstrained, share) for share in (None, 1.0))
+    errors, unconstrained = linear.observation.scanner_errors, linear.observation.unconstrained
+    shown, unit = (field_scatter(errors, unconstrained, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
     assert np.max(shares[:-1]) < 0.2
 

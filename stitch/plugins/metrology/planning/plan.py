@@ -17,7 +17,7 @@ from stitch.numerics.least_squares import equilibrated
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns, view_responses
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
-from stitch.observations.surfaces.scanner_errors import field_scatter
+from stitch.observations.surfaces.scanner_errors import field_scatter, smooth_errors
 from stitch.plugins.metrology.planning.detection_chances import Outlook, view_outlook
 from stitch.plugins.metrology.planning.expected_model import (
     FEWEST,
@@ -96,7 +96,7 @@ class PossibleViews:
         errors = errors.restricted(errors.causes - set(foreign_effects))
         sizes = self.scatter.variances(errors.names)
         covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
-        field = field_scatter(m, unconstrained)
+        field = field_scatter(smooth_errors(m, unconstrained), unconstrained)
         covariance += field @ field.T
         # Of every view against all others.
         information = np.zeros((g.views, 6, 6))
