@@ -139,7 +139,7 @@ def unseen_shape_error(linear: LinearModel, candidate: Candidate, detectable: di
         scan = measurement.capture.scans[v]
         index = even_indices(len(scan.points), _SHAPE_POINTS)
         points, normals = scan.points[index], scan.normals[index]
-        along = np.einsum("pni,ni->np", slopes.at(v, poses[v], index), normals)
+        along = slopes.along(v, poses[v], index, normals).T
         moves = column_space(np.hstack([np.cross(points, normals), normals]))
         squares.append(np.mean((along - moves @ (moves.T @ along)) ** 2, axis=0))
     sizes = [size if np.isfinite(size := detectable.get(p.name, np.inf)) else p.typical for p in term.parameters]

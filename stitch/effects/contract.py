@@ -253,7 +253,8 @@ class Effect:
     prior: float = 1.0  # prior odds relative to an effect that every arm, mount or part may have
     origin: str = ""  # of a user's: the file that it was loaded from, or `package …`; empty for one of this program
     scanner: str = ""  # the only scanner that has it, of several; empty: all
-    # Of the sensor, where parameters act in proportion: (points (N, 3), view) → (P, N, 3) per unit; None: not known.
+    # Of the sensor, where parameters act in proportion: (points (N, 3), view, direction (N, 3) or (3,)) → (P, N), how
+    # far points move along it per unit; None: not known.
     per_unit: Callable[..., Any] | None = None
 
     @property

@@ -42,7 +42,7 @@ def _effect(
     group: str,
     name: str,
     formula: str,
-    per_unit: Callable[[Array, ScanView], Array],
+    per_unit: Callable[[Array, ScanView, Array], Array],
     needs: tuple[str, ...] = (),
     **specs: Spec,
 ) -> Effect:
@@ -50,7 +50,8 @@ def _effect(
 
     def distort(points: Array, view: ScanView, **values: float) -> Array:
         """Return points (N, 3) of a view, scanner frame, moved by all parameters."""
-        return points + np.tensordot([values[name] for name in specs], per_unit(points, view), axes=1)
+        amounts = [values[name] for name in specs]
+        return points + np.stack([amounts @ per_unit(points, view, axis) for axis in np.eye(3)], axis=1)
 
     distort.__doc__ = formula
     return Effect(
@@ -67,9 +68,9 @@ def _bias(name: str, order: int, shape: Array) -> Effect:
         shape: (V,) P of the covariate scaled to ±1, at each view.
     """
 
-    def along_ray(points: Array, view: ScanView) -> Array:
-        """Return how a bias of 1 moves points (N, 3) of a view, scanner frame: (1, N, 3)."""
-        return shape[view.index] * view.along(points)[None]
+    def along_ray(points: Array, view: ScanView, direction: Array) -> Array:
+        """Return how far (1, N) a bias of 1 moves points (N, 3) of a view along a direction, scanner frame."""
+        return shape[view.index] * np.sum(view.along(points) * direction, axis=1)[None]
 
     formula = f"along the ray by k·P{order}({name})"
     return _effect(name, f"bias_{order}_of_{name}", formula, along_ray, k=number("mm", 0.1, 5.0))
@@ -84,16 +85,13 @@ def _field() -> Effect:
     names = ["".join(factors) for factors in _MONOMIALS]
     sizes = [0.1 / prod(_REACH[factor] for factor in factors) for factors in _MONOMIALS]
 
-    def monomials(points: Array, view: ScanView) -> Array:
-        """Return how a unit of each coefficient moves points (N, 3) of a view, scanner frame: (27, N, 3)."""
+    def monomials(points: Array, view: ScanView, direction: Array) -> Array:
+        """Return how far (27, N) a unit of each coefficient moves points (N, 3) of a view along a direction."""
         x, y, z = view.away(points).T
         ray = np.sqrt(x * x + y * y + z * z)
         at = {"a": x / z, "b": y / z, "d": ray / view.views.standoff - 1}
-        moved = np.zeros((3, len(_MONOMIALS), len(points), 3))
-        products = [prod(at[factor] for factor in factors) for factors in _MONOMIALS]
-        for axis in range(3):
-            moved[axis, ..., axis] = products
-        return moved.reshape(-1, len(points), 3)
+        products = np.array([prod(at[factor] for factor in factors) for factors in _MONOMIALS])
+        return (np.atleast_2d(direction).T[:, None] * products).reshape(-1, len(points))
 
     formula = "x = x* + c·(polynomials of the second degree in x/z, y/z and r/r₀ − 1)"
     specs = {

@@ -398,10 +398,35 @@ class PointSlopes:
             pose: (4, 4) T_reference_scanner of the view.
         """
         points, view = scan_points(self.measurement, v, index)
-        return self._slopes(
-            lambda terms: point_correction(terms, points, view, pose, steps=1),
-            lambda per_unit: -per_unit(points, view),
-        )
+
+        def exact_slopes(per_unit: Callable[..., Array]) -> Array:
+            """Return (P, N, 3) what undoes a unit of each parameter of an effect."""
+            return np.stack([-per_unit(points, view, axis) for axis in np.eye(3)], axis=-1)
+
+        return self._slopes(partial(_correction_change, points, view, pose), exact_slopes)
+
+    def along(self, v: int, pose: Array, index: Indices, direction: Array) -> Array:
+        """Return the derivatives (P, N) along unit vectors (N, 3), scanner frame, for the points of view v at `index`.
+
+        A point that comes more than once, as with several partners, is corrected once.
+
+        Args:
+            pose: (4, 4) T_reference_scanner of the view.
+        """
+        every = scan_points(self.measurement, v, index)
+        different, position = np.unique(index, return_inverse=True)
+        points, view = scan_points(self.measurement, v, different)
+
+        def change_along(up: Sequence[Term], down: Sequence[Term]) -> Array:
+            """Return how far (N,) the corrections by two sets of effects differ along the directions."""
+            change = _correction_change(points, view, pose, up, down).take(position, axis=0)
+            return np.einsum("ni,ni->n", change, direction)
+
+        def exact_slopes(per_unit: Callable[..., Array]) -> Array:
+            """Return (P, N) what undoes a unit of each parameter of an effect, along the directions."""
+            return -per_unit(*every, direction)
+
+        return self._slopes(change_along, exact_slopes)
 
     def at_targets(self, poses: Array) -> Array:
         """Return the derivatives (P, V, S, 3), sensor frame, for the labelled points of all views.
@@ -416,25 +441,33 @@ class PointSlopes:
 
         def exact_slopes(per_unit: Callable[..., Array]) -> Array:
             """Return (P, V, S, 3) what undoes a unit of each parameter of an effect; zero in empty slots."""
-            moved = np.array([per_unit(points, view) for points, view in zip(in_scanner, views, strict=True)])
-            return np.where((sightings.target >= 0)[..., None], -moved.swapaxes(0, 1), 0.0)
+            of_views = zip(in_scanner, views, strict=True)
+            moved = np.array([[per_unit(points, view, axis) for axis in np.eye(3)] for points, view in of_views])
+            return np.where((sightings.target >= 0)[..., None], -moved.transpose(2, 0, 3, 1), 0.0)
 
-        return self._slopes(lambda terms: target_correction(self.measurement, terms, poses, places), exact_slopes)
+        def change(up: Sequence[Term], down: Sequence[Term]) -> Array:
+            """Return by how much (V, S, 3) the corrections by two sets of effects differ."""
+            corrected = (target_correction(self.measurement, terms, poses, places) for terms in (up, down))
+            return np.subtract(*corrected)
+
+        return self._slopes(change, exact_slopes)
 
     def _slopes(
-        self, correction: Callable[[Sequence[Term]], Array], exact_slopes: Callable[[Callable[..., Array]], Array]
+        self,
+        change: Callable[[Sequence[Term], Sequence[Term]], Array],
+        exact_slopes: Callable[[Callable[..., Array]], Array],
     ) -> Array:
-        """Return the derivatives (P, …, 3) of a correction by the parameters of all terms.
+        """Return the derivatives (P, …) of a correction by the parameters of all terms.
 
         Args:
-            correction: called with effects; returns the vectors (…, 3) that undo them.
-            exact_slopes: called with an effect's `per_unit`; returns the derivatives (p, …, 3) by its p parameters.
+            change: called with two sets of effects; returns by how much (…) what undoes them differs.
+            exact_slopes: called with an effect's `per_unit`; returns the derivatives (p, …) by its p parameters.
         """
-        slopes = [correction(())[None][:0]]
+        slopes = [change((), ())[None][:0]]
         for term, steps in zip(self.terms, self._steps, strict=True):
             per_unit = term.effect.per_unit
             if steps is not None:
-                slopes += [((correction(up) - correction(down)) / width)[None] for up, down, width in steps]
+                slopes += [(change(up, down) / width)[None] for up, down, width in steps]
             elif per_unit is not None:
                 slopes.append(exact_slopes(per_unit))
         return np.concatenate(slopes)
@@ -459,6 +492,11 @@ class PointSlopes:
                 [(up.terms, down.terms, 2 * size or 1.0) for (up, down), size in zip(stepped, sizes, strict=True)]
             )
         return steps
+
+
+def _correction_change(points: Array, view: ScanView, pose: Array, up: Sequence[Term], down: Sequence[Term]) -> Array:
+    """Return by how much (N, 3), scanner frame, the corrections of points (N, 3) by two sets of effects differ."""
+    return point_correction(up, points, view, pose, steps=1) - point_correction(down, points, view, pose, steps=1)
 
 
 def _stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:

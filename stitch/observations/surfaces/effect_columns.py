@@ -60,7 +60,7 @@ def view_responses(
         sums = stream_point_sums(
             unconstrained,
             measurement.capture.noise_factor,
-            lambda v, index, normal: motion_along_normals(slopes, v, unconstrained.poses[v], index, normal),
+            lambda v, index, normal: slopes.along(v, unconstrained.poses[v], index, normal).T,
             lambda: slopes.at_targets(unconstrained.poses),
         )
     twists = apparent_twists(sums, unconstrained) if sums else None
@@ -119,7 +119,7 @@ def stream_point_sums(
     # By number of the match, so of the pair: Σ w Bᵀg, Σ w g e and Σ w g gᵀ, summed over its parts.
     sums = dict[int, tuple[Array, ...]]()
     for block in _match_blocks(unconstrained.overlaps.matches):
-        changes = _split_by_view(_distance_changes([m for _, m in block], slopes), per_view)
+        changes = _distance_changes([m for _, m in block], slopes, per_view)
         end = 0
         for number, m in block:
             start, end = end, end + len(m.residual)
@@ -132,19 +132,6 @@ def stream_point_sums(
     rows += _target_pair_sums(unconstrained, noise_factor, of_targets, per_view)
     vectors, residuals, squares = (np.array(column) for column in zip(*rows, strict=True))
     return PointGram(vectors, residuals, squares)
-
-
-def motion_along_normals(slopes: PointSlopes, v: int, pose: Array, index: Indices, normal: Array) -> Array:
-    """Return how far points of view v move along unit normals (N, 3), scanner frame, per unit of P parameters: (N, P).
-
-    Args:
-        slopes: of the parameters.
-        pose: (4, 4) T_reference_scanner of the view.
-        index: (N,) numbers of the points, which may come more than once.
-    """
-    # A point has several partners, and moves alike for all.
-    points, position = np.unique(index, return_inverse=True)
-    return np.einsum("kni,ni->nk", slopes.at(v, pose, points).take(position, axis=1), normal)
 
 
 def _split_by_view(changes: Array, per_view: int) -> Array:
@@ -175,31 +162,36 @@ def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]
         yield block
 
 
-def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
-    """Return the changes (N, 2, K) of the distances of N correspondences by the points of the first and second view.
+def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array], per_view: int) -> Array:
+    """Return the changes (N, K + per_view) of the distances of N correspondences per unit of K parameters.
 
-    They are per unit of each of K parameters, match after match. The point of the second view counts negative, as in
-    the distance. `slopes` is called once a view, with all its points: a call costs more than its points.
+    They come match after match, with columns as `_split_by_view` has them. `slopes` is called once a view, with all its
+    points: a call costs more than its points.
 
     Args:
         slopes: called with a view, numbers (n,) of its points and their normals (n, 3); returns (n, K), how far these
             points move along the normals.
+        per_view: the first `per_view` of the K have a value of their own in each view.
     """
-    ends = np.cumsum([len(m.residual) for m in matches])
-    normal = np.concatenate([m.normal for m in matches])
-    # By view: per match that it is in, its points, their rows among the N, and 1 where it is the second view, else 0.
-    queries = defaultdict[int, list[tuple[Indices, Indices, Indices]]](list)
-    for second in range(2):
-        for m, end in zip(matches, ends, strict=True):
-            rows = np.arange(end - len(m.residual), end)
-            view, index = (m.w, m.index_w) if second else (m.v, m.index_v)
-            queries[view].append((index, rows, np.full(len(rows), second)))
-    out = np.zeros((len(normal), 2, 0))
-    for view in sorted(queries):
-        index, rows, is_second = (np.concatenate(column) for column in zip(*queries[view], strict=True))
-        moved = slopes(view, index, normal.take(rows, axis=0))
-        out = out if out.shape[2] else np.zeros((len(normal), 2, moved.shape[1]))
-        out[rows, is_second] = np.where(is_second[:, None] == 1, -moved, moved)
+    # By view: its matches, their rows among the N, and 1 where it is the second view, else 0.
+    sides = defaultdict[int, list[tuple[Match, slice, int]]](list)
+    end = 0
+    for m in matches:
+        start, end = end, end + len(m.residual)
+        sides[m.v].append((m, slice(start, end), 0))
+        sides[m.w].append((m, slice(start, end), 1))
+    out = np.zeros((end, 0))
+    for view in sorted(sides):
+        index = np.concatenate([m.index_w if second else m.index_v for m, _, second in sides[view]])
+        moved = slopes(view, index, np.concatenate([m.normal for m, _, _ in sides[view]]))
+        out = out if out.shape[1] else np.zeros((end, moved.shape[1] + per_view))
+        done = 0
+        for m, rows, second in sides[view]:
+            # The point of the second view counts negative, as in the distance.
+            part = moved[done : done + len(m.residual)] * (1 - 2 * second)
+            done += len(part)
+            out[rows, second * per_view : (second + 1) * per_view] = part[:, :per_view]
+            out[rows, 2 * per_view :] += part[:, per_view:]
     return out
 
 

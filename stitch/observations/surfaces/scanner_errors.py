@@ -22,7 +22,6 @@ from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.effect_columns import (
     PointGram,
     apparent_twists,
-    motion_along_normals,
     stream_point_sums,
 )
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, SCANNER_SCALE
@@ -186,7 +185,7 @@ def sum_smooth_errors(
         smooth = shapes.along_normals(normal) * has_errors[v]
         if not further.terms:
             return smooth
-        return np.hstack([smooth, motion_along_normals(further, v, unconstrained.poses[v], index, normal)])
+        return np.hstack([smooth, further.along(v, unconstrained.poses[v], index, normal).T])
 
     def of_targets() -> Array:
         """Return how unit errors move the labelled points (K, V, S, 3), sensor frame, length_unit."""
