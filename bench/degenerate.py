@@ -72,7 +72,7 @@ _TEXTS = (
     "../up",
     "=1+1",
 )
-_STAGES = ("match_pairs", "unconstrained_poses", "fit_hand_eye")
+_STAGES = ("match_pairs", "unconstrained_poses", "solve_hand_eye")
 _PATHS = ("jobs", "chosen", "own", "trust", "stop")
 _BODIES: tuple[Any, ...] = (
     {"kind": "note", "text": "seen"},

@@ -24,8 +24,8 @@ from stitch.observations.surfaces.hand_eye_fit import (
     HandEyeSolution,
     Repeatability,
     capture_repeatability,
-    fit_hand_eye,
     hand_eye_jacobian,
+    hand_eye_statistics,
     solve_hand_eye,
 )
 from stitch.observations.surfaces.normal_equations import (
@@ -134,7 +134,7 @@ def correct(
         """Return the hand-eye of the last solution with its covariance."""
         common = None if scanner_errors is None else scanner_errors(unconstrained)
         errors = None if pose_error_prior is None else pose_error_prior(unconstrained, T_first)
-        return fit_hand_eye(captures, unconstrained, T_first, scanner_errors=common, errors=errors, solved=solved)
+        return hand_eye_statistics(solved, errors, common)
 
     announce("correct: what the corrected hand-eye leaves")
     final = tuple(

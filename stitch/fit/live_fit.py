@@ -15,7 +15,7 @@ from stitch.fit.correct import REUSE_GATE, Correction
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import hand_eye_statistics, solve_hand_eye
 from stitch.observations.surfaces.matching import (
     MINIMUM_OVERLAP,
     Match,
@@ -58,7 +58,7 @@ class LiveFit:
 
 
 # Called with a capture, its free-network poses and a hand-eye (4, 4); returns the prior of pose errors, and the
-# scanner's errors by source, as `fit_hand_eye` takes them.
+# scanner's errors by source, as `solve_hand_eye` takes them.
 ErrorPrior = Callable[[Capture, UnconstrainedPoses, Array], tuple[PoseErrors, dict[str, list[Array]]]]
 
 
@@ -124,7 +124,8 @@ def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:
     if fit.drifted > _SEARCH_ANEW * fit.gate:
         unconstrained = unconstrained_poses(fit.capture, fit.capture.poses(fit.T_mount), fit.gate)
     errors, of_scanner = prior(fit.capture, unconstrained, fit.T_mount)
-    hand_eye = fit_hand_eye([fit.capture], [unconstrained], fit.T_mount, scanner_errors=of_scanner, errors=errors)
+    solution = solve_hand_eye([fit.capture], [unconstrained], fit.T_mount, scanner_errors=of_scanner)
+    hand_eye = hand_eye_statistics(solution, errors, of_scanner)
     return LiveFit(
         fit.capture,
         hand_eye.T_mount,

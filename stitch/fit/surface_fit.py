@@ -29,7 +29,8 @@ from stitch.observations.surfaces.hand_eye_fit import (
     SCANNER_SCALE,
     FittedEffects,
     HandEyeFit,
-    fit_hand_eye,
+    hand_eye_statistics,
+    solve_hand_eye,
     whiten_captures,
 )
 from stitch.observations.surfaces.normal_equations import (
@@ -161,9 +162,9 @@ class LinearisedSurfaces:
         effects = FittedEffects(
             tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * sizes_of(terms)[fitted]
         )
-        hand_eye = fit_hand_eye(
-            self.captures, self.unconstrained, self.model.T_mount, effects, self._common_errors(choice), errors
-        )
+        common = self._common_errors(choice)
+        solution = solve_hand_eye(self.captures, self.unconstrained, self.model.T_mount, effects, common)
+        hand_eye = hand_eye_statistics(solution, errors, common)
         values = before.copy()
         # Held parameters, as the time of an event, are not fitted and keep their values.
         values[~self._held] = 0.0

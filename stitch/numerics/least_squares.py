@@ -212,20 +212,10 @@ def _pseudo_inverse(scaled: Array, unit: Array, relative: float = 1e-14) -> Arra
     return (vectors / values[shown]) @ vectors.T
 
 
-@dataclass(frozen=True)
-class GeneralisedFit:
-    """Generalised least squares with a prior, solved for any n observations: estimates of a unknowns."""
+def generalised_fit(noise: Array, columns: Array, precision: Array) -> tuple[Array, Array]:
+    """Return gain G (a, n) and covariance C (a, a) of the generalised least squares of z = columns·x + noise.
 
-    gain: Array  # (a, n)
-    covariance: Array  # (a, a)
-
-    def solve(self, z: Array, prior_vector: Array) -> Array:
-        """Return estimates (a,) from observations z (n,) and the prior's precision times its mean (a,)."""
-        return self.gain @ z + self.covariance @ prior_vector
-
-
-def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
-    """Return the generalised least-squares fit of z = columns·x + noise; units may be mixed.
+    The estimate is x = G z + C p, with p (a,) the prior's precision times its mean. Units may be mixed.
 
     Args:
         noise: (n, n) covariance, positive definite.
@@ -235,7 +225,7 @@ def generalised_fit(noise: Array, columns: Array, precision: Array) -> Generalis
     weighted = cho_solve(cho_factor(noise, lower=True), columns)
     scaled, unit = equilibrated(columns.T @ weighted + precision)
     covariance = np.linalg.inv(scaled) * np.outer(unit, unit)
-    return GeneralisedFit(covariance @ weighted.T, covariance)
+    return covariance @ weighted.T, covariance
 
 
 def column_space(columns: Array, relative: float = 1e-9) -> Array:

@@ -14,7 +14,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import equilibrated
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns
-from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import hand_eye_statistics, solve_hand_eye
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.run_data import HandEyeTransfer
@@ -35,14 +35,16 @@ def hand_eye_transfer(
         unconstrained: its views moved by their overlaps alone, and the twists from the model's poses there.
         model: the given hand-eye and effects, with their covariances.
     """
-    T_mount = fit_hand_eye([capture], [unconstrained], model.T_mount).T_mount
+    T_mount = solve_hand_eye([capture], [unconstrained], model.T_mount).T_mount
     # Views that start far off have not converged, which would count as scatter: once more from there.
     unconstrained = unconstrained_poses(capture, capture.poses(T_mount), unconstrained.overlaps.gate)
     errors = rig_scanner_errors([measurement], [unconstrained])
     columns = view_columns(measurement, model, unconstrained)
     errors[_EFFECTS] = [columns @ model.effects_covariance.root(model.terms)]
     poses = prior_pose_errors([measurement], model, [unconstrained.overlaps.gram.centre])
-    fitted = fit_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors, errors=poses)
+    fitted = hand_eye_statistics(
+        solve_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors), poses, errors
+    )
     turn, distance = hand_eye_difference(capture, model.T_mount, fitted.T_mount)
     xi = frames.log(frames.inverse(model.T_mount) @ fitted.T_mount)
     part_centre = _part_centre(capture)

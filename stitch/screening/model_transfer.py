@@ -20,7 +20,7 @@ from stitch.numerics.distributions import chi2_tail, f_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import significantly_smaller
 from stitch.numerics.units import length_text
-from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import solve_hand_eye
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.screening.hand_eye_transfer import hand_eye_difference, hand_eye_transfer, mahalanobis_square
 from stitch.screening.hypotheses import sentence
@@ -57,7 +57,7 @@ def require_matching_hand_eye(
         NoResultError: it is.
     """
     capture, views = correction.captures[index], correction.unconstrained[index]
-    fitted = fit_hand_eye([capture], [views], correction.model.T_mount)
+    fitted = solve_hand_eye([capture], [views], correction.model.T_mount)
     if not beyond_any_arm(session, *hand_eye_difference(capture, correction.model.T_mount, fitted.T_mount)):
         return
     transfer = hand_eye_transfer(measurement, capture, views, correction.model)

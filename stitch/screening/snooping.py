@@ -388,11 +388,12 @@ def _weigh_few_views(usual: UsualEffects, unconstrained: UnconstrainedPoses, mod
     errors = prior.of_ordinary_arm.project(model.reduced.reduction)
     covariances = errors.scales[:, None, None] ** 2 * errors.components
     rotation, translation = usual_twist(measurement.length_unit)[[0, 3]]
-    white = rotation**2 * model.reduced.rotation + translation**2 * model.reduced.translation
+    of_rotation, of_translation, of_noise = model.reduced.components
+    white = rotation**2 * of_rotation + translation**2 * of_translation
     scanner = np.hstack([columns[0] for columns in rig_scanner_errors([measurement], [unconstrained]).values()])
     smooth = model.reduced.reduction @ scanner
     z, A = model.z, model.mixed().A[0]
-    fixed = _NOISE_FACTOR * model.reduced.noise + smooth @ smooth.T
+    fixed = _NOISE_FACTOR * of_noise + smooth @ smooth.T
     of_arm = errors.arm_components
     varying = covariances[of_arm].sum(axis=0), white + covariances[~of_arm].sum(axis=0)
     without, square = _log_evidence(z, A, fixed, *varying)

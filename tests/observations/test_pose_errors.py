@@ -21,7 +21,7 @@ from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.observations.observability import unobservable
 from stitch.observations.pose_errors import prior_pose_errors
-from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import hand_eye_statistics, solve_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.session.capture import prepare_capture
@@ -135,7 +135,7 @@ def test_sigmas_hold_on_arms_that_are_a_little_wrong_everywhere(cell):
         x = moved(cell, draw_arm(arm.joints, SIZE, np.random.default_rng([seed, 5])).flange(arm, q))
         seen = replace(freed, twists=own + x - x.mean(axis=0))
         for k, errors in enumerate((prior, None)):
-            found = fit_hand_eye([measurement.capture], [seen], T, errors=errors)
+            found = hand_eye_statistics(solve_hand_eye([measurement.capture], [seen], T), errors)
             xi = frames.log(frames.inverse(found.T_mount) @ T)
             squares[k] += xi @ np.linalg.solve(found.covariance, xi)
     assert squares[0] < chi2.ppf(0.999, 36)
@@ -159,8 +159,8 @@ def test_a_rig_at_equal_poses_knows_its_hand_eye_no_better_than_one_session(cell
     for seed in range(3):
         x = moved(cell, draw_arm(arm.joints, SIZE, np.random.default_rng(seed)).flange(arm, q))
         seen = [replace(f, twists=f.twists + about(f, freed, x)) for f in both]
-        one = fit_hand_eye(captures[:1], seen[:1], T, errors=prior_of(cell)).covariance
-        rig = fit_hand_eye(captures, seen, T, errors=prior)
+        one = hand_eye_statistics(solve_hand_eye(captures[:1], seen[:1], T), prior_of(cell)).covariance
+        rig = hand_eye_statistics(solve_hand_eye(captures, seen, T), prior)
         falls.append(np.exp((np.linalg.slogdet(rig.covariance)[1] - np.linalg.slogdet(one)[1]) / 12))
         xi = frames.log(frames.inverse(rig.T_mount) @ T)
         square += xi @ np.linalg.solve(rig.covariance, xi)

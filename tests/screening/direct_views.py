@@ -13,7 +13,7 @@ def direct_views(z, reduction=None, errors=None):
     R = np.eye(len(z)) if reduction is None else reduction
     common, turns = np.tile(np.eye(6), (len(z) // 6, 1)), np.arange(len(z)) % 6 < 3
     rotation, translation = (R[:, half] @ R[:, half].T for half in (turns, ~turns))
-    reduced = ReducedPoses(R, R.T, z, R @ common, rotation, translation, 1e-8 * np.eye(len(z)))
+    reduced = ReducedPoses(R, R.T, z, R @ common, np.array([rotation, translation, 1e-8 * np.eye(len(R))]))
     return ViewModel(reduced, common.reshape(-1, 6, 6), np.zeros(3), 1.0, errors=errors)
 
 

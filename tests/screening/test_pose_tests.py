@@ -304,7 +304,6 @@ def seen_views(seed, views, factor=1.0, scatter=1.0, displaced=0.0):
         model.reduced,
         z=seen @ twists.ravel(),
         hand_eye=seen @ mounts.reshape(-1, 6),
-        noise=1e-8 * np.eye(len(seen)),
     )
     return replace(model, reduced=reduced, mount_jacobians=mounts), T
 

@@ -22,7 +22,6 @@ from stitch.numerics import frames
 from stitch.numerics.folds import grouped_folds
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import (
-    GeneralisedFit,
     column_space,
     generalised_fit,
     project_out,
@@ -80,9 +79,9 @@ class ReducedPoses:
     expansion: Array  # (6V, n) back to the shortest twists, a radian as long as what it moves at the part
     z: Array  # (n,) observed twists, reduction @ twists
     hand_eye: Array  # (n, 6) response to the hand-eye's ξ
-    rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
-    translation: Array  # (n, n) the same for translation
-    noise: Array  # (n, n) covariance of the sensor noise within overlaps
+    # (3, n, n) covariances of unit rotation scatter and unit translation scatter of the flange, and of the sensor noise
+    # within overlaps: `WHITE_COMPONENTS`.
+    components: Array
 
 
 @dataclass(frozen=True)
@@ -153,8 +152,8 @@ class RigModel:
         reduced = [(e.reduced_poses, e.effect_twists) for e in self.parts]
         return np.concatenate([np.column_stack([r.hand_eye, r.reduction @ twists]) for r, twists in reduced])
 
-    def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> GeneralisedFit:
-        """Return generalised least squares of β (6 + P,) for z = X β + e, with cov e block-diagonal by session.
+    def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> tuple[Array, Array]:
+        """Return gain and covariance (`generalised_fit`) of β (6 + P,) in z = X β + e, cov e block-diagonal by session.
 
         Args:
             scatter: per session the scatter of the flange and the noise factor, which give its block of cov e.
@@ -175,11 +174,7 @@ class RigModel:
             errors: components (6V, 6V) of the twists of all views of the rig, session after session.
         """
         reduced = [e.reduced_poses for e in self.parts]
-        white = (
-            block_diag(*(r.rotation for r in reduced)),
-            block_diag(*(r.translation for r in reduced)),
-            block_diag(*(r.noise for r in reduced)),
-        )
+        white = [block_diag(*of_sessions) for of_sessions in zip(*(r.components for r in reduced), strict=True)]
         R = block_diag(*(r.reduction for r in reduced))
         components = np.array([*white, *(R @ C @ R.T for C in errors.components)])
         shared = block_diag(*(e.common_columns @ e.common_columns.T for e in self.parts))[None]
@@ -211,7 +206,8 @@ class HandEyeSolution:
     scatter: tuple[Repeatability, ...]  # per session
     prior: Array  # (6 + P, 6 + P) precision
     prior_vector: Array  # (6 + P,) precision times mean
-    gls: GeneralisedFit
+    gain: Array  # (6 + P, N) from z to x
+    covariance: Array  # (6 + P, 6 + P) of x under white scatter and prior
     x: Array
     values: Array  # (P,) of the parameters before the step
     hidden: Array  # (6, m) twists of the hand-eye that the motions do not show, one sigma of the weak prior each
@@ -243,43 +239,28 @@ class HandEyeFit:
         return np.sqrt(np.maximum(np.diag(self.values_covariance), 1e-300))
 
 
-def fit_hand_eye(
-    captures: Sequence[Capture],
-    unconstrained: Sequence[UnconstrainedPoses],
-    T_mount: Array,
-    effects: FittedEffects | None = None,
-    scanner_errors: Mapping[str, Sequence[Array]] | None = None,
+def hand_eye_statistics(
+    solution: HandEyeSolution,
     errors: PoseErrors | None = None,
-    solved: HandEyeSolution | None = None,
+    scanner_errors: Mapping[str, Sequence[Array]] | None = None,
 ) -> HandEyeFit:
-    """Return the hand-eye, and P parameters of effects, by generalised least squares over the views of all captures.
+    """Return the hand-eye and the P parameters of a solution with their covariance and other statistics.
 
-    The estimate weighs the views by their white scatter (`solve_hand_eye`). Its covariance (6 + P, 6 + P) is then made
-    larger: the sum of what white scatter, repeating errors of the arm, errors of the scanner and unseen directions do
-    to this estimate. The first six are the right twist ξ of T_mount·exp(ξ), rad before length_unit.
+    The covariance (6 + P, 6 + P) is the sum of what white scatter, repeating errors of the arm, errors of the scanner
+    and unseen directions do to this estimate. The first six are the right twist ξ of T_mount·exp(ξ), rad before
+    length_unit.
 
     Args:
-        unconstrained: per capture the views moved by the overlaps alone, and the twists from the model's poses there.
-        T_mount: (4, 4) hand-eye of these model's poses; the problem is linear about it.
-        effects: fitted together with the hand-eye; None: no effects.
-        scanner_errors: by source, per capture left twists (6V, K) that the views show for one sigma of each of K
-            errors that all views and captures have in common. They change the estimate of several scanners only.
         errors: pose errors beside white scatter; None: there are none. Scatter of the joints is not counted twice: the
             scatter of the flange, as estimated, contains it.
-        solved: result of `solve_hand_eye` for the same arguments, to save its time.
+        scanner_errors: as in `solve_hand_eye`.
     """
-    # Through surfaces that two scanners see, the errors of one would move the hand-eye of the other. Such views weigh
-    # less if the errors are in the covariance of the estimate too.
-    several_scanners = any(capture.scanner is not None for capture in captures)
-    errors_by_source = list((scanner_errors or {}).values()) if several_scanners else []
-    common = [np.hstack(of_capture) for of_capture in zip(*errors_by_source, strict=True)]
-    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, effects, common)
-    errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
+    errors = errors or white_scatter_only(sum(e.gram.views for e in solution.rig.parts))
     repeating = errors.restricted(errors.causes - {JOINT_SCATTER})
     sources = _variance_sources(solution, repeating, scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
     # The inflation is the geometric mean, over the 6 + P parameters, of the ratio of this covariance to the estimate's.
-    log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(solution.gls.covariance)[1]
+    log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(solution.covariance)[1]
     visible = covariance[:6].copy()
     # Directions that no motion shows were fixed in the fit: their variance is that of the weak prior.
     sources["unseen"][:6, :6] += solution.hidden @ solution.hidden.T
@@ -311,7 +292,7 @@ def _variance_sources(
         errors: pose errors beside white scatter, of all views of the rig.
         scanner_errors: by source, per capture left twists (6V, K) of the views for one sigma of each of K errors.
     """
-    rig, gls = solution.rig, solution.gls
+    rig, gain = solution.rig, solution.gain
     mixed = rig.mixed(errors)
     # Of white scatter alone the solution has the variances already: the fit begins there.
     start = None if errors.names else solution.scatter[0].variances
@@ -319,16 +300,16 @@ def _variance_sources(
     is_well_known = not errors.names and mixed.size > _PLUG_IN
     variances = fit.variances if is_well_known else mean_variances(mixed, fit)
     components = zip((*WHITE_COMPONENTS, *errors.names), variances, mixed.components[:, 0], strict=True)
-    sources = {name: variance * gls.gain @ C @ gls.gain.T for name, variance, C in components}
+    sources = {name: variance * gain @ C @ gain.T for name, variance, C in components}
     for name, twists in scanner_errors.items():
         columns = rig.reduce(twists)
-        shift = gls.gain @ columns
+        shift = gain @ columns
         # One scanner's scale shows in the views themselves: it is known better than by its sigma, or is off by more.
         if name == SCANNER_SCALE and not rig.parts[0].common_twists.size:
             scatter = np.einsum("c,cij->ij", variances, mixed.components[:, 0])
             shift = shift @ _posterior_root(rig, scatter, columns)
         sources[name] = shift @ shift.T
-    sources["unseen"] = gls.covariance @ solution.prior @ gls.covariance
+    sources["unseen"] = solution.covariance @ solution.prior @ solution.covariance
     return sources
 
 
@@ -377,8 +358,9 @@ def _heldout_ratio(solution: HandEyeSolution) -> float:
                 rest.append((kept, scatter))
             if rest:
                 rig = RigModel([part for part, _ in rest])
-                gls = rig.fit_gls([of_part for _, of_part in rest], solution.prior)
-                squares += e.squares(fold, (gls.solve(rig.z, solution.prior_vector), solution.x))
+                gain, covariance = rig.fit_gls([of_part for _, of_part in rest], solution.prior)
+                x = gain @ rig.z + covariance @ solution.prior_vector
+                squares += e.squares(fold, (x, solution.x))
     return float(np.sqrt(squares[0] / squares[1])) if squares[1] > 0 else float("nan")
 
 
@@ -387,19 +369,25 @@ def solve_hand_eye(
     unconstrained: Sequence[UnconstrainedPoses],
     T_mount: Array,
     effects: FittedEffects | None = None,
-    common: Sequence[Array] = (),
+    scanner_errors: Mapping[str, Sequence[Array]] | None = None,
 ) -> HandEyeSolution:
-    """Return the estimate of hand-eye and effects by generalised least squares; `fit_hand_eye` adds its covariance.
+    """Return hand-eye, and P parameters of effects, by generalised least squares over the views of all captures.
 
     Views weigh by the scatter of the flange that each capture shows (REML). A weak prior keeps unseen directions small.
+    `hand_eye_statistics` tells the covariance.
 
     Args:
         unconstrained: per capture the views moved by the overlaps alone, and the twists from the model's poses there.
         T_mount: (4, 4) hand-eye of these model's poses; the problem is linear about it.
         effects: fitted together with the hand-eye; None: no effects.
-        common: per capture left twists (6V, K) of the views per sigma of K further errors, counted in the covariance
-            of the observations; (): there are none.
+        scanner_errors: by source, per capture left twists (6V, K) that the views show for one sigma of each of K
+            errors that all views and captures have in common. They change the estimate of several scanners only.
     """
+    # Through surfaces that two scanners see, the errors of one would move the hand-eye of the other. Such views weigh
+    # less if the errors are in the covariance of the observations.
+    several_scanners = any(capture.scanner is not None for capture in captures)
+    by_source = list((scanner_errors or {}).values()) if several_scanners else []
+    common = [np.hstack(of_capture) for of_capture in zip(*by_source, strict=True)]
     no_columns = tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained)
     if effects is None:
         effects = FittedEffects(no_columns, np.zeros(0), np.zeros(0))
@@ -417,14 +405,15 @@ def solve_hand_eye(
     prior[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
     # The prior of the effects is about the value 0, the unknowns are changes from `effects.values`.
     prior_vector = np.concatenate([np.zeros(6), -effects.values * effects.prior**-2.0])
-    gls = rig.fit_gls(scatter, prior)
-    x = gls.solve(rig.z, prior_vector)
+    gain, covariance = rig.fit_gls(scatter, prior)
+    x = gain @ rig.z + covariance @ prior_vector
     return HandEyeSolution(
         rig=rig,
         scatter=scatter,
         prior=prior,
         prior_vector=prior_vector,
-        gls=gls,
+        gain=gain,
+        covariance=covariance,
         x=x,
         values=effects.values,
         hidden=hidden,
@@ -489,14 +478,13 @@ def reduce_poses(capture: Capture, g: Gram, twists: Array, T_mount: Array) -> Re
         # Views scanned at one stop share its scatter: their blocks are added.
         by_view, blocks = blocks, np.zeros((capture.stop.max() + 1, *blocks.shape[1:]))
         np.add.at(blocks, capture.stop, by_view)
+    of_rotation, of_translation = summed_squares(blocks[..., :3]), summed_squares(blocks[..., 3:])
     return ReducedPoses(
         reduction=reduction,
         expansion=seen.scale[:, None] * seen.vectors,
         z=reduction @ twists.reshape(-1),
         hand_eye=reduction @ hand_eye_jacobian(capture, T_mount, g.centre),
-        rotation=summed_squares(blocks[..., :3]),
-        translation=summed_squares(blocks[..., 3:]),
-        noise=np.diag(g.variance / seen.values),
+        components=np.array([of_rotation, of_translation, np.diag(g.variance / seen.values)]),
     )
 
 
@@ -507,8 +495,7 @@ def hand_eye_mixed_model(reduced: ReducedPoses, further: Array | None = None) ->
         further: (n, K) columns; None: the hand-eye alone.
     """
     mean = reduced.hand_eye if further is None else np.column_stack([reduced.hand_eye, further])
-    components = np.array([reduced.rotation, reduced.translation, reduced.noise])[:, None]
-    return MixedModel(reduced.z[None], mean_basis(mean)[None], components)
+    return MixedModel(reduced.z[None], mean_basis(mean)[None], reduced.components[:, None])
 
 
 def mean_basis(columns: Array) -> Array:
@@ -525,7 +512,7 @@ def estimate_repeatability(
     errors are correlated. β is free: X are the responses to the hand-eye and the `further` columns.
 
     Args:
-        reduced: z (n,), its response to the hand-eye and C_r, C_t, C_n (n, n).
+        reduced: z (n,), its response to the hand-eye, and C_r, C_t, C_n (n, n) as `components`.
         further: (n, K) more columns of X, those of effects; None: the hand-eye alone.
         common: B (n, K), errors of unit variance that are known to be there; None: none.
     """
@@ -542,11 +529,7 @@ def repeatability_from(variances: Array) -> Repeatability:
 
 def pose_covariance(reduced: ReducedPoses, scatter: Repeatability) -> Array:
     """Return the covariance (n, n) of reduced poses z for a scatter of the flange and a noise factor."""
-    return (
-        scatter.rotation**2 * reduced.rotation
-        + scatter.translation**2 * reduced.translation
-        + scatter.noise_factor * reduced.noise
-    )
+    return np.tensordot(scatter.variances, reduced.components, axes=1)
 
 
 def whiten_captures(

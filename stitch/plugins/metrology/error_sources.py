@@ -145,7 +145,7 @@ def error_chain(run: RunData) -> ErrorChain:
     effects = FittedEffects((columns[:, fitted],), values_of(model.terms)[fitted], WEAK * sizes_of(model.terms)[fitted])
     solution = solve_hand_eye([capture], [unconstrained], model.T_mount, effects)
     part = solution.rig.parts[0]
-    answer = solution.gls.gain @ part.reduced_poses.reduction
+    answer = solution.gain @ part.reduced_poses.reduction
     centre = unconstrained.overlaps.gram.centre
     follow = _follow_overlaps(run, capture, solution, centre)
     of_views = np.column_stack(
@@ -270,7 +270,7 @@ def _model_modes(run: RunData, chain: ErrorChain) -> Iterator[_Modes]:
         effects = run.model.effects_covariance.root(run.terms)[chain.fitted]
         yield OTHER_RUN, chain.of_model(block_diag(_root(run.mount_covariance), effects)), _MANY
         return
-    yield UNSEEN, chain.of_model(solution.gls.covariance @ _root(solution.prior)), _MANY
+    yield UNSEEN, chain.of_model(solution.covariance @ _root(solution.prior)), _MANY
     if solution.hidden.size:
         hand_eye = np.eye(6 + int(chain.fitted.sum()))[:, :6]
         yield UNSEEN, chain.of_model(hand_eye @ solution.hidden), _MANY

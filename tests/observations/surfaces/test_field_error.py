@@ -24,7 +24,7 @@ from stitch.effects.contract import EFFECTS
 from stitch.numerics import frames
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError, FieldMap, field_error, robust_pass_share
-from stitch.observations.surfaces.hand_eye_fit import SCANNER_SCALE, fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import SCANNER_SCALE, hand_eye_statistics, solve_hand_eye
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import gram
 from stitch.observations.surfaces.scanner_errors import (
@@ -427,7 +427,7 @@ def test_U_covers_what_data_sheets_state(cell):
     source = {SCANNER_SCALE: [scale_scatter(measurement, views)]}
     off = []
     for scanner_errors in ({}, source):
-        found = fit_hand_eye([capture], [views], T, scanner_errors=scanner_errors)
+        found = hand_eye_statistics(solve_hand_eye([capture], [views], T), scanner_errors=scanner_errors)
         xi = frames.log(frames.inverse(found.T_mount) @ T)
         off.append(np.abs(xi) / np.sqrt(np.diag(found.covariance)))
     assert off[1].max() < 2

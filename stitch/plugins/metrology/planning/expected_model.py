@@ -481,7 +481,7 @@ class ExpectedHandEye:
 def expected_hand_eye(
     linear: ExpectedModel, simulated: SimulatedViews, feature: Array | None = None
 ) -> ExpectedHandEye:
-    """Predict the fit of `fit_hand_eye`: least squares under the scatter alone, the covariance under all errors.
+    """Predict `hand_eye_statistics`: least squares under the scatter alone, the covariance under all errors.
 
     Args:
         feature: (3,) reference frame: the place whose displacement U counts; None: the middle of what the views see.
@@ -494,14 +494,12 @@ def expected_hand_eye(
         [simulated.measurement.capture], [simulated.unconstrained], linear.model.T_mount, linear.sizes[6:]
     )
     scatter = np.einsum("c,cij->ij", sizes[: NOISE + 1], components[: NOISE + 1])
-    weighed = generalised_fit(scatter, columns, prior)
-    sources = {
-        name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in zip(names, sizes, components, strict=True)
-    }
+    gain, of_estimate = generalised_fit(scatter, columns, prior)
+    sources = {name: size * gain @ C @ gain.T for name, size, C in zip(names, sizes, components, strict=True)}
     if linear.mixed.fixed is not None:
         field = (USUAL_SHARE / ALARM_SHARE) ** 2 * linear.mixed.fixed[0]
-        sources["scanner field"] = weighed.gain @ field @ weighed.gain.T
-    sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
+        sources["scanner field"] = gain @ field @ gain.T
+    sources["unseen"] = of_estimate @ prior @ of_estimate
     covariance = np.sum(list(sources.values()), axis=0)
     # The hand-eye is what the first six rows are of; mean share of every source in its variance, over its directions.
     scaled, unit = equilibrated(covariance[:6, :6])
