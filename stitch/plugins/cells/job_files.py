@@ -25,7 +25,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.session_files import SessionFiles, TableColumns, write_sessions
-from stitch.session.reading.csv_files import finite_number, read_csv_rows
+from stitch.session.reading.csv_files import TableRow, read_csv_rows
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
 
@@ -174,13 +174,13 @@ def read_columns(file: Path, texts: str, numbers: str) -> CsvColumns:
             )
     if not rows:
         raise InputError(f"{file}: no rows below the header; to fix: add one per line")
-    for line, row in rows:
+    for row in rows:
         for name in texts.split():
             if not row[name]:
-                raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
+                raise InputError(f"{row.where}: {name} is empty; to fix: write a name")
     return CsvColumns(
-        {name: [row[name] for _, row in rows] for name in texts.split()},
-        {name: np.array([_number(file, line, name, row[name]) for line, row in rows]) for name in numbers.split()},
+        {name: [row[name] for row in rows] for name in texts.split()},
+        {name: np.array([_number(row, name) for row in rows]) for name in numbers.split()},
         len(rows),
     )
 
@@ -192,10 +192,10 @@ def require_unique(file: Path, what: str, names: list[str]) -> None:
             raise InputError(f"{file}: {what} {name} stands twice; to fix: leave one of them out, or rename it")
 
 
-def _number(file: Path, line: int, name: str, cell: str) -> float:
-    value = finite_number(file, line, name, cell)
+def _number(row: TableRow, name: str) -> float:
+    value = row.number(name)
     if abs(value) > HIGHEST_VALUE:
-        raise InputError(f"{file} line {line}: {name} is {cell.strip()!r}; to fix: write a number that a cell can have")
+        raise InputError(f"{row.where}: {name} is {row[name]!r}; to fix: write a number that a cell can have")
     return value
 
 

@@ -72,7 +72,7 @@ def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[st
     if not rows:
         raise InputError(f"{file}: no views; write one row per scan")
     names = [*covariate_names(header, rows), *(["time_s"] if "time_s" in header else [])]
-    cells = {name: [float(row[name]) for _, row in rows if is_number(row[name])] for name in names}
+    cells = {name: [float(row[name]) for row in rows if is_number(row[name])] for name in names}
     columns = {name: [x for x in numbers if np.isfinite(x)] for name, numbers in cells.items()}
     times = columns.pop("time_s", [])
     covariates = {name: float(np.mean(numbers)) for name, numbers in columns.items() if numbers}

@@ -3,6 +3,7 @@
 import csv
 import re
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +20,33 @@ _LONGEST_HEADER = 1 << 20
 _UNIT_TOLERANCE = 1e-3
 
 
-def read_csv_rows(file: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Return the names of the columns, and (line number from 1, column -> cell) of all lines that are not empty.
+class TableRow(dict[str, str]):
+    """A row of a table: column -> cell, without blanks around it."""
 
-    Cells have no blanks around them.
+    def __init__(self, file: Path, line: int, cells: Mapping[str, str]) -> None:
+        super().__init__(cells)
+        self.file = file
+        self.line = line  # its number in the file, from 1
+
+    @property
+    def where(self) -> str:
+        """File and line, for messages."""
+        return f"{self.file} line {self.line}"
+
+    def number(self, column: str, remedy: str = "write a finite number") -> float:
+        """Return the number in a column, as `finite_number`."""
+        return finite_number(self.file, self.line, column, self[column], remedy)
+
+
+def read_csv_rows(file: Path) -> tuple[list[str], list[TableRow]]:
+    """Return the names of the columns, and all rows that are not empty.
 
     Raises:
         InputError: the file is not text, is not separated by commas, a quote stays open, or a row has more or fewer
             cells than the header.
     """
     require_file(file, "write the table")
-    rows: list[tuple[int, dict[str, str]]] = []
+    rows: list[TableRow] = []
     first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
@@ -42,7 +59,7 @@ def read_csv_rows(file: Path) -> tuple[list[str], list[tuple[int, dict[str, str]
                 if any(cell.strip() for cell in row):
                     _require_cells(file, reader.line_num, row, header)
                     cells = (cell.strip() for cell in row)
-                    rows.append((reader.line_num, dict(zip(header, cells, strict=True))))
+                    rows.append(TableRow(file, reader.line_num, dict(zip(header, cells, strict=True))))
                 first = reader.line_num + 1
     except UnicodeDecodeError:
         raise InputError(not_utf8(file, "CSV UTF-8")) from None

@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics import frames
-from stitch.session.reading.csv_files import finite_number, read_csv_rows, require_unit_quaternion
+from stitch.session.reading.csv_files import TableRow, read_csv_rows, require_unit_quaternion
 from stitch.session.reading.text_files import require_file, require_name, shortened
 from stitch.session.session import NominalTargets, Sighting
 
@@ -29,16 +29,16 @@ def read_points(file: Path, known: Collection[str]) -> dict[str, Sighting]:
     """
     rows: dict[str, dict[str, list[float]]] = {}
     lines: dict[tuple[str, str], int] = {}
-    for line, row in _target_rows(file, ("view", "target", *_XYZ)):
+    for row in _target_rows(file, ("view", "target", *_XYZ)):
         view, target = row["view"], row["target"]
-        _require_view(file, line, view, known)
+        _require_view(row, known)
         if (view, target) in lines:
             raise InputError(
-                f"{file} line {line}: view {view} shows target {target} on line {lines[view, target]} already; "
+                f"{row.where}: view {view} shows target {target} on line {lines[view, target]} already; "
                 "leave one out, or name it otherwise"
             )
-        lines[view, target] = line
-        rows.setdefault(view, {})[target] = _point_numbers(file, line, row)
+        lines[view, target] = row.line
+        rows.setdefault(view, {})[target] = _point_numbers(row)
     sightings = {}
     for view, targets in rows.items():
         numbers = np.array(list(targets.values()))
@@ -58,12 +58,9 @@ def read_targets(file: Path, sighted: Sequence[str]) -> NominalTargets:
     """
     lines: dict[str, int] = {}
     table = []
-    for line, row in _target_rows(file, ("target", *_XYZ)):
-        name = row["target"]
-        if name in lines:
-            raise InputError(f"{file} line {line}: target {name} stands on line {lines[name]} already; leave one out")
-        lines[name] = line
-        table.append(_point_numbers(file, line, row))
+    for row in _target_rows(file, ("target", *_XYZ)):
+        _add_line(lines, row, "target")
+        table.append(_point_numbers(row))
     if not set(lines) & set(sighted):
         raise InputError(
             f"{file}: none of its targets ({', '.join(list(lines)[:4])}) is seen in points.csv "
@@ -86,23 +83,32 @@ def read_frames(file: Path, known: Collection[str]) -> dict[str, Sighting]:
     require_file(file, f"a frames session needs {','.join(('view', *_POSE))} there")
     sightings: dict[str, Sighting] = {}
     lines: dict[str, int] = {}
-    for line, row in _table_rows(file, ("view", *_POSE), f"{file}: no poses; write one row per view"):
-        name = row["view"]
-        if name in lines:
-            raise InputError(f"{file} line {line}: view {name} stands on line {lines[name]} already; leave one out")
-        _require_view(file, line, name, known)
-        lines[name] = line
-        pose = np.array([finite_number(file, line, column, row[column]) for column in _POSE])
-        require_unit_quaternion(f"{file} line {line}", pose[3:])
+    for row in _table_rows(file, ("view", *_POSE), f"{file}: no poses; write one row per view"):
+        _add_line(lines, row, "view")
+        _require_view(row, known)
+        pose = np.array([row.number(column) for column in _POSE])
+        require_unit_quaternion(row.where, pose[3:])
         T = frames.from_quaternion(pose[:3], pose[3:])
-        sigma = _column_sigma(file, line, row, "sigma")
-        sigma_rotation = float(np.radians(_column_sigma(file, line, row, "sigma_deg")))
-        sightings[name] = Sighting((_PROBE,), T[None, :3, 3], np.array([sigma]), T[:3, :3], sigma_rotation)
+        sigma = _column_sigma(row, "sigma")
+        sigma_rotation = float(np.radians(_column_sigma(row, "sigma_deg")))
+        sightings[row["view"]] = Sighting((_PROBE,), T[None, :3, 3], np.array([sigma]), T[:3, :3], sigma_rotation)
     return sightings
 
 
-def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[tuple[int, dict[str, str]]]:
-    """Return for every row of a table its line number and column -> cell, stripped.
+def _add_line(lines: dict[str, int], row: TableRow, column: str) -> None:
+    """Add the line of a row under its name in a column, target or view.
+
+    Raises:
+        InputError: the name stands on another line already.
+    """
+    name = row[column]
+    if name in lines:
+        raise InputError(f"{row.where}: {column} {name} stands on line {lines[name]} already; leave one out")
+    lines[name] = row.line
+
+
+def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[TableRow]:
+    """Return the rows of a table that has some columns, and a row at least.
 
     Args:
         needed: columns that the table must have.
@@ -120,55 +126,51 @@ def _table_rows(file: Path, needed: Sequence[str], empty: str) -> list[tuple[int
     return rows
 
 
-def _target_rows(file: Path, needed: Sequence[str]) -> list[tuple[int, dict[str, str]]]:
-    """Return for every row of a table its line number and column -> cell; each row must name a target.
+def _target_rows(file: Path, needed: Sequence[str]) -> list[TableRow]:
+    """Return the rows of a table, each of which names a target.
 
     Raises:
         InputError: as `_table_rows`, or a name is empty or cannot be printed.
     """
     rows = _table_rows(file, needed, f"{file}: no rows; write {','.join(needed)}[,sigma] a row")
-    for line, row in rows:
+    for row in rows:
         if not row["target"]:
-            raise InputError(f"{file} line {line}: target is empty; give it a name")
-        require_name(f"{file} line {line}", row["target"], "target")
+            raise InputError(f"{row.where}: target is empty; give it a name")
+        require_name(row.where, row["target"], "target")
     return rows
 
 
-def _require_view(file: Path, line: int, view: str, known: Collection[str]) -> None:
-    """Refuse the name of a view that views.csv does not have.
+def _require_view(row: TableRow, known: Collection[str]) -> None:
+    """Refuse a row of a view that views.csv does not have.
 
     Raises:
         InputError: names the line.
     """
+    view = row["view"]
     if view not in known:
-        raise InputError(
-            f"{file} line {line}: view {shortened(view)} is not in views.csv; add it there or remove the row"
-        )
+        raise InputError(f"{row.where}: view {shortened(view)} is not in views.csv; add it there or remove the row")
 
 
-def _point_numbers(file: Path, line: int, row: dict[str, str]) -> list[float]:
+def _point_numbers(row: TableRow) -> list[float]:
     """Return x, y, z and sigma of a row, length_unit; sigma is NaN where its cell is empty or the column absent.
-
-    Args:
-        row: column -> cell.
 
     Raises:
         InputError: no number, or a sigma that is not positive.
     """
-    place = [finite_number(file, line, column, row[column]) for column in _XYZ]
-    sigma = finite_number(file, line, "sigma", row["sigma"]) if row.get("sigma") else float("nan")
+    place = [row.number(column) for column in _XYZ]
+    sigma = row.number("sigma") if row.get("sigma") else float("nan")
     if sigma <= 0:
-        raise InputError(f"{file} line {line}: sigma is {sigma:g}; write a positive number or leave it empty")
+        raise InputError(f"{row.where}: sigma is {sigma:g}; write a positive number or leave it empty")
     return [*place, sigma]
 
 
-def _column_sigma(file: Path, line: int, row: dict[str, str], column: str) -> float:
+def _column_sigma(row: TableRow, column: str) -> float:
     """Return the standard deviation in a column of a row; NaN where the table has no such column.
 
     Raises:
         InputError: the cell is empty, no number, or not positive.
     """
-    sigma = finite_number(file, line, column, row[column]) if column in row else float("nan")
+    sigma = row.number(column) if column in row else float("nan")
     if sigma <= 0:
-        raise InputError(f"{file} line {line}: {column} is {sigma:g}; write a positive number")
+        raise InputError(f"{row.where}: {column} is {sigma:g}; write a positive number")
     return sigma

@@ -16,7 +16,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.axes import Axis
-from stitch.session.reading.csv_files import finite_number, is_number, read_csv_rows, require_unit_quaternion
+from stitch.session.reading.csv_files import TableRow, is_number, read_csv_rows, require_unit_quaternion
 from stitch.session.reading.text_files import require_file, require_name
 from stitch.session.robot import Robot, forward
 from stitch.session.session import View
@@ -62,73 +62,67 @@ def read_views(file: Path, robot: Robot | None, axes: Sequence[Axis] = (), lengt
         InputError: names the line and how to fix it.
     """
     require_file(file, "a session needs a row per scan there")
-    header, cells = read_csv_rows(file)
+    header, table = read_csv_rows(file)
     columns = [_axis_column(file, header, axis, length_unit) for axis in axes]
     joint_count = _check_header(file, header, robot, has_axes=bool(axes))
-    if not cells:
+    if not table:
         raise InputError(f"{file}: no views; write one row per scan")
-    covariates = covariate_names(header, cells)
-    joints = [_row_joints(file, line, row, joint_count) for line, row in cells]
-    for line, row in cells:
+    covariates = covariate_names(header, table)
+    joints = [_row_joints(row, joint_count) for row in table]
+    for row in table:
         for column in columns:
-            finite_number(file, line, column, row[column], "write the axis' reading in every row")
-    require_loads(file, header, cells, joint_count)
-    _require_own_names(file, cells)
-    times = _row_times(file, cells)
+            row.number(column, "write the axis' reading in every row")
+    require_loads(file, header, table, joint_count)
+    _require_own_names(table)
+    times = _row_times(table)
     has_poses = has_pose_columns(header) or not axes
     rows: list[ViewRow] = []
-    for i, (line, row) in enumerate(cells):
+    for i, row in enumerate(table):
         view = View(
             name=row["view"],
             cloud=None,
-            covariates={column: finite_number(file, line, column, row[column]) for column in covariates if row[column]},
-            T_base_flange=_flange_pose(file, line, row, joints[i], robot) if has_poses else np.eye(4),
+            covariates={column: row.number(column) for column in covariates if row[column]},
+            T_base_flange=_flange_pose(row, joints[i], robot) if has_poses else np.eye(4),
             joints=joints[i],
-            approach=_row_approach(file, line, row, joints[i], joints[i - 1] if i else None),
+            approach=_row_approach(row, joints[i], joints[i - 1] if i else None),
             time_s=times[i],
         )
-        rows.append(ViewRow(line, row.get("cloud", ""), view))
-    _require_no_hidden_joints(file, cells, [row.view.T_base_flange for row in rows], robot)
+        rows.append(ViewRow(row.line, row.get("cloud", ""), view))
+    _require_no_hidden_joints(table, [row.view.T_base_flange for row in rows], robot)
     return rows
 
 
-def _require_own_names(file: Path, cells: Sequence[tuple[int, dict[str, str]]]) -> None:
+def _require_own_names(table: Sequence[TableRow]) -> None:
     """Refuse views whose name is empty, that of another view, or cannot be printed.
-
-    Args:
-        cells: of every row its line number and column -> cell.
 
     Raises:
         InputError: names the line.
     """
     lines: dict[str, int] = {}
-    for line, row in cells:
+    for row in table:
         name = row["view"]
         if not name or name in lines:
             wrong = f"is used on line {lines[name]} already" if name else "is empty"
-            raise InputError(f"{file} line {line}: view {name!r} {wrong}; every view needs an id of its own")
-        lines[require_name(f"{file} line {line}", name, "view")] = line
+            raise InputError(f"{row.where}: view {name!r} {wrong}; every view needs an id of its own")
+        lines[require_name(row.where, name, "view")] = row.line
 
 
-def _row_times(file: Path, cells: Sequence[tuple[int, dict[str, str]]]) -> list[float | None]:
+def _row_times(table: Sequence[TableRow]) -> list[float | None]:
     """Return the time of each row, s; None where the row states none.
-
-    Args:
-        cells: of every row its line number and column -> cell.
 
     Raises:
         InputError: a time before that of an earlier row: approach, settling and drifts count on the order.
     """
     times: list[float | None] = []
     latest = -np.inf
-    for line, row in cells:
-        time_s = finite_number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+    for row in table:
+        time_s = row.number("time_s") if row.get("time_s") else None
         times.append(time_s)
         if time_s is None:
             continue
         if time_s < latest:
             raise InputError(
-                f"{file} line {line}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go "
+                f"{row.where}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go "
                 "on counting"
             )
         latest = time_s
@@ -228,13 +222,9 @@ def _require_joint_columns(file: Path, header: Sequence[str], robot: Robot | Non
     return len(numbers)
 
 
-def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
-    """Return the names of the columns that hold a number in some row and are neither poses, joints nor time.
-
-    Args:
-        cells: of every row its line number and column -> cell.
-    """
-    return [name for name in header if _may_be_covariate(name) and any(is_number(row[name]) for _, row in cells)]
+def covariate_names(header: Sequence[str], table: Sequence[TableRow]) -> list[str]:
+    """Return the names of the columns that hold a number in some row and are neither poses, joints nor time."""
+    return [name for name in header if _may_be_covariate(name) and any(is_number(row[name]) for row in table)]
 
 
 def _may_be_covariate(column: str) -> bool:
@@ -259,28 +249,20 @@ def require_covariate_name(where: str, name: str) -> str:
     return name
 
 
-def _row_joints(file: Path, line: int, row: dict[str, str], count: int) -> Array | None:
-    """Return the joint angles (count,) of a row, rad; None where all their cells are empty.
-
-    Args:
-        row: column -> cell.
-        count: number of joint columns.
-    """
+def _row_joints(row: TableRow, count: int) -> Array | None:
+    """Return the joint angles (count,) of a row, rad; None where all their cells are empty."""
     names = [f"j{i + 1}_deg" for i in range(count)]
     if not any(row[name] for name in names):
         return None
-    return np.radians([finite_number(file, line, name, row[name]) for name in names])
+    return np.radians([row.number(name) for name in names])
 
 
-def _row_approach(
-    file: Path, line: int, row: dict[str, str], joints: Array | None, before: Array | None
-) -> Array | None:
+def _row_approach(row: TableRow, joints: Array | None, before: Array | None) -> Array | None:
     """Return the direction (n,) from which each joint came, −1, 0 or +1; None without joints.
 
     As the columns jN_approach state it, else the sign of the change since the row before; 0 in the first row.
 
     Args:
-        row: column -> cell.
         joints, before: (n,) rad, of this row and of the one before; None: it has none.
     """
     if joints is None:
@@ -289,23 +271,22 @@ def _row_approach(
     for k in range(len(joints)):
         column = f"j{k + 1}_approach"
         if row.get(column):
-            approach[k] = finite_number(file, line, column, row[column])
+            approach[k] = row.number(column)
             if approach[k] not in (-1, 0, 1):
-                raise InputError(f"{file} line {line}: {column} is {row[column]}; use -1, 0 or 1")
+                raise InputError(f"{row.where}: {column} is {row[column]}; use -1, 0 or 1")
     return approach
 
 
-def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]], joints: int) -> None:
+def require_loads(file: Path, header: Sequence[str], table: Sequence[TableRow], joints: int) -> None:
     """Refuse torques or payloads that only some views or some joints have: gravity would silently stand in for them.
 
     Args:
-        cells: of every row its line number and column -> cell.
         joints: number of joints in the table.
 
     Raises:
         InputError: names the line or the columns, and how to fix it.
     """
-    filled = [name for name in header if any(row[name] for _, row in cells)]
+    filled = [name for name in header if any(row[name] for row in table)]
     torques = [name for name in filled if _TORQUE.match(name)]
     if torques and joints and sorted(torques) != sorted(f"j{i + 1}_torque_nm" for i in range(joints)):
         raise InputError(
@@ -313,32 +294,30 @@ def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, 
             "column a joint, or take them out"
         )
     for name in [*torques, *(name for name in filled if name == _PAYLOAD)]:
-        for line, row in cells:
-            value = finite_number(file, line, name, row[name], "write a number in every row, or take the column out")
+        for row in table:
+            value = row.number(name, "write a number in every row, or take the column out")
             if name == _PAYLOAD and value < 0:
-                raise InputError(f"{file} line {line}: {name} is {value:g}; to fix: write a mass, 0 for none")
+                raise InputError(f"{row.where}: {name} is {value:g}; to fix: write a mass, 0 for none")
             if abs(value) > (_LARGEST_KG if name == _PAYLOAD else _LARGEST_NM):
-                raise InputError(f"{file} line {line}: {name} is {value:g}, as on no arm; to fix: correct its unit")
+                raise InputError(f"{row.where}: {name} is {value:g}, as on no arm; to fix: correct its unit")
 
 
-def _flange_pose(file: Path, line: int, row: dict[str, str], joints: Array | None, robot: Robot | None) -> Array:
+def _flange_pose(row: TableRow, joints: Array | None, robot: Robot | None) -> Array:
     """Return T_base_flange (4, 4) of a row, length_unit: the reported pose, else the one computed from the joints.
 
     Args:
-        row: column -> cell.
         joints: (n,) rad; None: the row has none.
 
     Raises:
         InputError: the row has neither, its quaternion is not of unit length, or the pose disagrees with the joints.
     """
-    where = f"{file} line {line}: view {row['view']}"
+    where = f"{row.where}: view {row['view']}"
     from_joints = forward(robot, joints) if robot and joints is not None else None
-    given = [row.get(column, "") for column in POSE_COLUMNS]
-    if not any(given):
+    if not any(row.get(column) for column in POSE_COLUMNS):
         if from_joints is None:
             raise InputError(f"{where} has no pose; fill {','.join(POSE_COLUMNS)} or the joints, or remove the row")
         return from_joints
-    values = np.array([finite_number(file, line, c, cell) for c, cell in zip(POSE_COLUMNS, given, strict=True)])
+    values = np.array([row.number(column) for column in POSE_COLUMNS])
     norm = require_unit_quaternion(where, values[3:])
     reported = frames.from_quaternion(values[:3], values[3:] / norm)
     if robot is not None and from_joints is not None:
@@ -367,31 +346,28 @@ def require_same_pose(where: str, reported: Array, from_joints: Array, metres_pe
         )
 
 
-def _require_no_hidden_joints(
-    file: Path, cells: Sequence[tuple[int, dict[str, str]]], poses: Sequence[Array], robot: Robot | None
-) -> None:
+def _require_no_hidden_joints(table: Sequence[TableRow], poses: Sequence[Array], robot: Robot | None) -> None:
     """Refuse joint angles in columns of other names, as J1 …, which would silently count as covariates.
 
     Columns are joint angles if, in degrees or in radians, the robot's kinematics lead from them to the poses.
 
     Args:
-        cells: of every row its line number and column -> cell.
         poses: T_base_flange (4, 4) of every row.
 
     Raises:
         InputError: names the columns, and what to call them.
     """
-    header = [*cells[0][1]] if cells else []
+    header = list(table[0])
     names = [] if any(map(_JOINT.match, header)) else _otherwise_named_joints(header)
     if robot is None or not names or len(names) != robot.n_joints:
         return
-    rows = [([row[name] for name in names], T) for (_, row), T in zip(cells, poses, strict=True)]
-    table = [([float(cell) for cell in row], T) for row, T in rows if all(map(is_number, row))]
+    cells = [([row[name] for name in names], T) for row, T in zip(table, poses, strict=True)]
+    filled = [([float(cell) for cell in of_row], T) for of_row, T in cells if all(map(is_number, of_row))]
     for unit, factor in (("", np.pi / 180), (", in degrees", 1.0)):
-        if table and all(_reaches_pose(robot, factor * np.array(joints), T) for joints, T in table):
+        if filled and all(_reaches_pose(robot, factor * np.array(joints), T) for joints, T in filled):
             raise InputError(
-                f"{file} line 1: columns {', '.join(names)} hold the joint angles of the robot; to fix: call them "
-                f"j1_deg … j{len(names)}_deg{unit}"
+                f"{table[0].file} line 1: columns {', '.join(names)} hold the joint angles of the robot; to fix: call "
+                f"them j1_deg … j{len(names)}_deg{unit}"
             )
 
 

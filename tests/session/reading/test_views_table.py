@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.edits import edit
 from stitch.errors import InputError
+from stitch.session.reading.csv_files import TableRow
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.session_folder import load_session
 from stitch.session.reading.views_table import require_loads
@@ -127,8 +128,9 @@ BOTH = ["j1_torque_nm", "j2_torque_nm"]
     ],
 )
 def test_torques_are_whole_or_refused(header, rows, told):
-    cells = [(line, dict(zip(header, row, strict=True))) for line, row in enumerate(rows, 2)]
+    file = Path("views.csv")
+    table = [TableRow(file, line, dict(zip(header, row, strict=True))) for line, row in enumerate(rows, 2)]
     if told is None:
-        return require_loads(Path("views.csv"), header, cells, joints=2)
+        return require_loads(file, header, table, joints=2)
     with pytest.raises(InputError, match=told):
-        require_loads(Path("views.csv"), header, cells, joints=2)
+        require_loads(file, header, table, joints=2)

@@ -360,7 +360,7 @@ def _has_reported_poses(file: Path) -> bool:
     if not file.is_file():
         return False
     header, rows = read_csv_rows(file)
-    return any(row[name] for _, row in rows for name in POSE_COLUMNS if name in header)
+    return any(row[name] for row in rows for name in POSE_COLUMNS if name in header)
 
 
 def robot_document(

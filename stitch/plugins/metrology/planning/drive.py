@@ -103,16 +103,16 @@ class DrivenCell:
         if self._count() <= before:
             return f"{name}: out of reach, or nothing is seen from there; {another}"
         table = self.folder / "views.csv"
-        line, view = [(line, row["view"]) for line, row in read_csv_rows(table)[1]][-1]
+        last = read_csv_rows(table)[1][-1]
         try:
-            load_session(self.folder, only=view)
+            load_session(self.folder, only=last["view"])
         except NothingMeasuredError:
-            rows_before = table.read_bytes().splitlines(keepends=True)[: line - 1]
+            rows_before = table.read_bytes().splitlines(keepends=True)[: last.line - 1]
             with whole_file(table) as scratch:
                 scratch.write_bytes(b"".join(rows_before))
             if not before:
                 table.unlink()
-            return f"{view}: its scan shows nothing, and its row is taken out of views.csv; {another}"
+            return f"{last['view']}: its scan shows nothing, and its row is taken out of views.csv; {another}"
         return ""
 
     def _measured(self) -> tuple[SessionData | None, RunData | None]:
