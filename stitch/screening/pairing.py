@@ -14,6 +14,7 @@ from stitch.screening.placement import (
     FEW_SHARED,
     ReferenceSurface,
     place_scan,
+    pose_distances,
     shows_no_surface,
     surface_of,
 )
@@ -29,8 +30,6 @@ from stitch.session.session import SessionData
 _CLOSER_SHARE = 0.2
 # One joint explains a displacement if it leaves less than this share of it.
 _MAX_REMAINING_SHARE = 0.1
-# Points of a scan that stand for it: every so many.
-_EVERY = 50
 # What sits elsewhere from some row on, by what moved.
 _MOVED = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}
 
@@ -139,14 +138,13 @@ def find_wrong_joint(
     joints = session.views[m.view].joints
     if robot is None or joints is None or m.T is None or session.axes:
         return None
-    points = snooping.capture.scans[m.view].points[::_EVERY]
-    on_surface = frames.transform(m.T, points)
+    scan, T_fits = snooping.capture.scans[m.view], m.T
 
     def distance_at(q: Array) -> float:
         """Return the rms distance (length_unit) of the scan's points at joints q (n,), rad, from where they fit."""
         T = forward(robot, q)
         T = frames.inverse(T) if session.mount == "eye_to_hand" else T
-        return float(np.sqrt(((frames.transform(T @ snooping.T_mount, points) - on_surface) ** 2).sum(axis=1).mean()))
+        return float(pose_distances(scan, T_fits, (T @ snooping.T_mount)[None])[0])
 
     best: tuple[float, int, float] = (np.inf, 0, 0.0)
     for j in range(len(joints)):
@@ -188,7 +186,7 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
         poses: (V, 4, 4) T_reference_scanner of the rows.
         T: (4, 4) T_reference_scanner where the scan fits.
     """
-    off = _pose_distances(capture, view, T, poses)
+    off = pose_distances(capture.scans[view], T, poses)
     best = int(np.argmin(off))
     close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER_SHARE * off[view]
     return best if close and best != view else None
@@ -210,19 +208,12 @@ def _row_where_it_fits(snooping: Snooping, surface: ReferenceSurface, view: int,
     for row in rows:
         T = snooping.expected[row]
         best = place_scan(capture.scans[view], surface, T[None], near)[0]
-        moved = float(_pose_distances(capture, view, best.T, T[None])[0])
+        moved = float(pose_distances(capture.scans[view], best.T, T[None])[0])
         if best.closure > snooping.needed and best.near > FEW_SHARED and moved < near:
             motion_needed[row] = moved
     if view in motion_needed:
         return None
     return min(motion_needed, key=lambda row: motion_needed[row], default=None)
-
-
-def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Array:
-    """Return (P,) the rms distance between the points of a scan at one pose (4, 4) and at others (P, 4, 4)."""
-    points = capture.scans[view].points[::_EVERY]
-    placed = frames.transform(T, points)
-    return np.sqrt(((frames.transform(poses, points) - placed) ** 2).sum(axis=2).mean(axis=1))
 
 
 def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:

@@ -37,6 +37,8 @@ _TURNS_ANYWHERE = 48
 # A scan of a line or of a point has no second direction: its extent there, as a share of the largest.
 _LINE = 1e-3
 _FEWEST = 30
+# Points of a scan that stand for it: every so many.
+_EVERY = 50
 # Points of each view that stand for it in its group.
 _GROUP_PROBES = 600
 # What shows less than this share of the surface cannot be seen to belong there.
@@ -278,7 +280,7 @@ def place_unlinked_views(
     unsure = {
         v
         for v, placement in singles.items()
-        if v in in_groups and _distance_from_rows(capture.scans[v], placement, model_poses) > near
+        if v in in_groups and pose_distances(capture.scans[v], placement.T, model_poses).min() > near
     }
     placed |= {v: placement for v, placement in singles.items() if v not in unsure}
     return placed, [v for v in alone if v not in placed], several
@@ -346,7 +348,7 @@ def _place_alone(
     shared = max(FEW_SHARED, HOLDING / scan.usable.sum())
     closed = closed_placements(scan, [p for p in placements if p.near > shared], model_poses, needed, size)
     row = model_poses[view : view + 1]
-    at_row = next((p for p in closed if _distance_from_rows(scan, p, row) < CLOSE_SHARE * size), None)
+    at_row = next((p for p in closed if pose_distances(scan, p.T, row)[0] < CLOSE_SHARE * size), None)
     if at_row is not None or not closed:
         return at_row, False
     return closed[0], has_rival(scan, closed[0], closed, size)
@@ -364,7 +366,7 @@ def closed_placements(
         needed: closure from which a scan counts as placed.
         size: of the part, length_unit.
     """
-    away = [_distance_from_rows(scan, p, model_poses) for p in placements]
+    away = [pose_distances(scan, p.T, model_poses).min() for p in placements]
     limit = [needed * (_CLOSURE_AT_ROW if distance < CLOSE_SHARE * size else 1.0) for distance in away]
     closed = [i for i, p in enumerate(placements) if p.closure > limit[i]]
     return [placements[i] for i in sorted(closed, key=lambda i: away[i])]
@@ -372,15 +374,15 @@ def closed_placements(
 
 def has_rival(scan: Scan, best: Placement, closed: Sequence[Placement], size: float) -> bool:
     """Return True if another placement elsewhere is about as good as the best one, wherever the rows' poses are."""
-    elsewhere = [p for p in closed if _distance_from_rows(scan, p, best.T[None]) > CLOSE_SHARE * size]
+    away = pose_distances(scan, best.T, np.array([p.T for p in closed]))
+    elsewhere = [p for p, distance in zip(closed, away, strict=True) if distance > CLOSE_SHARE * size]
     return any(p.surface_share > _AS_GOOD * best.surface_share for p in elsewhere)
 
 
-def _distance_from_rows(scan: Scan, placement: Placement, model_poses: Array) -> float:
-    """Return the rms distance (length_unit) of a placed scan's points from where the nearest row's pose puts them."""
-    points = scan.points[::50]
-    displacement = frames.transform(model_poses, points) - frames.transform(placement.T, points)
-    return float(np.sqrt((displacement**2).sum(axis=2).mean(axis=1)).min())
+def pose_distances(scan: Scan, T: Array, poses: Array) -> Array:
+    """Return (P,) the rms distance, length_unit, between a scan's points at one pose (4, 4) and at others (P, 4, 4)."""
+    points = scan.points[::_EVERY]
+    return np.sqrt(((frames.transform(poses, points) - frames.transform(T, points)) ** 2).sum(axis=2).mean(axis=1))
 
 
 def place_groups(

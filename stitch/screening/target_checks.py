@@ -22,6 +22,7 @@ from stitch.screening.motions import RelativeScans
 from stitch.screening.moved_targets import find_moved_targets
 from stitch.screening.problems import SessionProblem, likeliest_text
 from stitch.session.capture import Capture, Sightings, build_capture, sightings_of
+from stitch.session.measurement import variance_within
 from stitch.session.session import SessionData
 
 # Arms that are off by this much, and by this share of how far the targets move, are bad and may be right; a better
@@ -126,9 +127,7 @@ def _motion_seen(capture: Capture) -> float:
     """
     s = capture.sightings
     assert s is not None
-    points, target = s.points[s.used], s.target[s.used]
-    squares = [np.sum((points[target == k] - points[target == k].mean(axis=0)) ** 2) for k in np.unique(target)]
-    return float(np.sqrt(np.sum(squares) / len(points)))
+    return float(np.sqrt(3 * variance_within(s.points[s.used], s.target[s.used])))
 
 
 def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:

@@ -495,14 +495,14 @@ def sensor_kind(session: SessionData) -> SensorKind | None:
     in_base = [sighting.points for _, sighting in sighted]
     on_flange = [frames.transform(frames.inverse(T), sighting.points) for T, sighting in sighted]
     target = np.unique(np.concatenate([sighting.targets for _, sighting in sighted]), return_inverse=True)[1]
-    spread = _variance_within(np.concatenate(in_base), target)
-    strays = _variance_within(np.concatenate(on_flange), target)
+    spread = variance_within(np.concatenate(in_base), target)
+    strays = variance_within(np.concatenate(on_flange), target)
     return "tracker" if strays < _SAME_FRAME**2 * spread else None
 
 
-def _variance_within(points: Array, group: Indices) -> float:
-    """Return the variance of points (N, 3) about the mean of their group (N,)."""
-    count = np.bincount(group)[:, None]
+def variance_within(points: Array, group: Indices) -> float:
+    """Return the variance of points (N, 3) about the mean of their group (N,), the average of x, y and z."""
+    count = np.maximum(np.bincount(group), 1)[:, None]
     mean = np.stack([np.bincount(group, x) for x in points.T], axis=1) / count
     return float(np.mean((points - mean[group]) ** 2))
 
