@@ -155,7 +155,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         contenders = [rescored_in(base, r) for r in contenders]
     ranked = _raise_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
-    contenders = likeliest_first(case.dictionary.credited(r, laws) for r in contenders)
+    contenders = list(likeliest_first(case.dictionary.credited(r, laws) for r in contenders))
     best = contenders[0]
     rivals = case.dictionary.without(base, laws, best)
     unmodelled = max([unmodelled_log_posterior(base), *(r.log_posterior for r in rivals)])

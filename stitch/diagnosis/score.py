@@ -115,7 +115,7 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     best = replace(
         best, observable=observable, p_value=p_value, log_bayes_factor=log_bayes_factor, log_shares=log_shares
     )
-    if not regime_of(base).prior:
+    if not regime_of(base).prior or best.variances is None:
         return best
     return replace(best, base_model=replace(base, null=at_variances(base.mixed, best.variances)))
 

@@ -321,7 +321,7 @@ def _bending_torques(effect: JointEffect) -> list[_Covariate]:
     """Return the torques that bend the joint of an effect; not those that never change."""
     torques = effect.base.measurement.views.torques
     bending = [t for t, k in enumerate(torques.joint) if k == effect.joint - 1 and np.ptp(torques.values[:, t]) > STILL]
-    covariates = []
+    covariates = list[_Covariate]()
     for t in bending:
         torque = torques.values[:, t]
         along_torque = partial(exponential_kernel, reach=len(bending) * float(np.ptp(torque)))

@@ -28,8 +28,10 @@ _OF_CELLS: tuple[tuple[str, str, Callable[[CellReport], float]], ...] = (
 )
 REPORT_FORMAT = "stitch-watch/1"
 # Keys that are called as the fields that they hold.
-_KEYS_OF_PARAMETERS = ("name", "unit", "value", "sigma", "common_sigma", "scatter", "drift_per_day", "drift_sigma")
-_KEYS_OF_PARAMETERS += ("process_noise", "limit")
+_KEYS_OF_PARAMETERS: tuple[str, ...] = (
+    *("name", "unit", "value", "sigma", "common_sigma", "scatter", "drift_per_day", "drift_sigma"),
+    *("process_noise", "limit"),
+)
 
 
 def dfq_text(history: History, report: CellReport) -> str:
