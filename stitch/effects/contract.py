@@ -495,7 +495,8 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     known_here = {
         "intensity": measurement.has_intensity,
         "optics": measurement.has_optics,
-        "surfaces": measurement.has_surfaces,
+        # A camera sees marks: no surface, at no slant.
+        "surfaces": measurement.sensor in (None, "area", "line"),
     }
     missing = [need for need in effect.needs if not known_here.get(need, views.has(need))]
     if effect.scanner and effect.scanner not in views.scanners.names:

@@ -155,7 +155,8 @@ def pose_tests(
     search = find_blunders(model, [*unplaced, *unlinked_blunders])
     model_with_effects = model
     if usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS:
-        model_with_effects = model.with_errors(usual.errors(unconstrained))
+        errors = usual.errors(unconstrained).project(model.reduced.reduction)
+        model_with_effects = replace(model, errors=errors)
     singles = search.mean_columns if unlinked_blunders or search.blunders else None
     steps = find_steps(model_with_effects, model.columns(unplaced), singles, chance)
     if steps:

@@ -37,7 +37,6 @@ from stitch.observations.surfaces.effect_columns import view_responses
 from stitch.observations.surfaces.hand_eye_fit import (
     ReducedPoses,
     hand_eye_jacobian,
-    hand_eye_mixed_model,
     reduce_poses,
 )
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
@@ -74,10 +73,6 @@ class ViewModel:
         """Return the model of an arm that may have effects: twists (6V, P) of the views, rad and length_unit."""
         columns = self.reduced.reduction @ twists
         return replace(self, usual=columns @ columns.T)
-
-    def with_errors(self, errors: PoseErrors) -> "ViewModel":
-        """Return the model of poses that may err beside white scatter, by twists of the views."""
-        return replace(self, errors=errors.project(self.reduced.reduction))
 
     @property
     def z(self) -> Array:
@@ -148,12 +143,8 @@ class ViewModel:
         """Return the model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
         mean = column_space(hstack_columns(self.hand_eye, further), SEEN)
         usual = None if self.usual is None else self.usual[None]
-        mixed = replace(self._scatter_model, A=mean[None], fixed=usual)
+        mixed = MixedModel(self.z[None], mean[None], self.reduced.components[:, None], usual)
         return mixed if self.errors is None else with_pose_errors(mixed, self.errors)
-
-    @cached_property
-    def _scatter_model(self) -> MixedModel:
-        return hand_eye_mixed_model(self.reduced)
 
     def fit(self, further: Array | None = None) -> VarianceFit:
         """Return the variances of the poses' scatter with further columns (n, K) free in the mean; each fit is cached.

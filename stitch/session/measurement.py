@@ -21,7 +21,7 @@ from stitch.session.axis_poses import axes_of
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
 from stitch.session.scanners import Scanners, scanners_of
-from stitch.session.session import Mount, SensorKind, SessionData, View
+from stitch.session.session import Mount, SensorKind, SessionData
 from stitch.session.torques import Torques, no_torques, torque_columns, torques_of_views
 from stitch.system.values import take_rows
 
@@ -276,11 +276,6 @@ class Measurement:
             return self.sensor not in ("tracker", "probe")
         return all_ahead(self.capture.point_sets)
 
-    @property
-    def has_surfaces(self) -> bool:
-        """True unless the sensor is known to see no surfaces, at no slant: a camera sees marks."""
-        return self.sensor in (None, "area", "line")
-
     def without(self, left_out: Sequence[int]) -> "Measurement":
         """Return the measurement without the views at the indices `left_out`.
 
@@ -313,7 +308,12 @@ def measurement_of(session: SessionData, capture: Capture) -> Measurement:
         capture: of the same session, from `prepare_capture`.
     """
     views = views_of(session)
-    intensity = _intensities(session)
+    # Per view standardised over the session, (I − Ī)/σ_I.
+    intensity: list[Array | None] = [None] * len(session.views)
+    if (scale := intensity_scale(session)) is not None:
+        mean, deviation = scale
+        clouds = [view.cloud for view in session.views]
+        intensity = [None if cloud is None else (cloud.scalars["intensity"] - mean) / deviation for cloud in clouds]
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
     scan_views = [
         ScanView(v, views, np.maximum(scan.confidence, MIN_COSINE), intensity[v], size=size, eye=scan.eye)
@@ -336,15 +336,6 @@ def measurement_of(session: SessionData, capture: Capture) -> Measurement:
         target_views=tuple(target_views),
         sensor=sensor_kind(session),
     )
-
-
-def _intensities(session: SessionData) -> list[Array | None]:
-    """Return per view intensities (N,) standardised over the session, (I − Ī)/σ_I; None in all if one view has none."""
-    scale = intensity_scale(session)
-    if scale is None:
-        return [None] * len(session.views)
-    mean, deviation = scale
-    return [None if v.cloud is None else (v.cloud.scalars["intensity"] - mean) / deviation for v in session.views]
 
 
 def intensity_scale(session: SessionData) -> tuple[float, float] | None:
@@ -389,7 +380,9 @@ def views_of(session: SessionData) -> Views:
     count = len(views)
     joints = approach = np.zeros((count, 0))
     torques = no_torques(count)
-    columns = _complete_columns(views)
+    # Those columns of views.csv that have a number in every view.
+    complete = set.intersection(*(set(view.covariates) for view in views))
+    columns = {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}
     if session.robot is not None and all(view.joints is not None for view in views):
         joints = np.array([view.joints for view in views])
         approach = np.array([view.approach for view in views])
@@ -423,12 +416,6 @@ def views_of(session: SessionData) -> Views:
             for of_view in scanners.masks(count)
         ),
     )
-
-
-def _complete_columns(views: Sequence[View]) -> dict[str, Array]:
-    """Return name -> values (V,) of the columns of views.csv that have a number in every view, sorted by name."""
-    complete = set.intersection(*(set(view.covariates) for view in views))
-    return {name: np.array([view.covariates[name] for view in views]) for name in sorted(complete)}
 
 
 def _gravity_of_views(axes: Axes, session: SessionData) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from stitch.model.forward import PointSlopes
 from stitch.model.model import Model, Term
-from stitch.numerics.distributions import chi2_tail, tukey
+from stitch.numerics.distributions import chi2_limit, tukey
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.least_squares import project_out
 from stitch.observations.surfaces.effect_columns import PointGram
@@ -157,24 +157,14 @@ def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> 
     Args:
         cause: SHARED, INCIDENCE or PER_VIEW, a number of `likelihood.design`.
     """
-
     shares, free = likelihood.ml_shares()
-
-    def gain_over(limit: float) -> float:
-        """Return the log likelihood, nats, that a free share of the cause gains over one of at most `limit`."""
-        return 0.5 * (likelihood.ml_shares({cause: limit})[1] - free)
-
-    def is_significant(gain: float) -> bool:
-        """Return True if a gain of log likelihood is significant at level `alpha`.
-
-        The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
-        """
-        return 0.5 * chi2_tail(2 * gain, 1) < alpha
-
-    gain = gain_over(ALARM_SHARE)
-    if not is_significant(gain):
+    gain = 0.5 * (likelihood.ml_shares({cause: ALARM_SHARE})[1] - free)
+    # The size lies on the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
+    least = 0.5 * chi2_limit(2 * alpha, 1)
+    if gain <= least:
         return _CauseSize(0.0, shares, gain, over_noise=False)
-    return _CauseSize(float(shares[cause]), shares, gain, is_significant(gain_over(1.0)))
+    over_noise = 0.5 * (likelihood.ml_shares({cause: 1.0})[1] - free) > least
+    return _CauseSize(float(shares[cause]), shares, gain, over_noise)
 
 
 def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
