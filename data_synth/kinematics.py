@@ -22,14 +22,15 @@ def links(arm: Arm, q: Array) -> Array:
     angle = q + arm.theta
     c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(arm.alpha), np.sin(arm.alpha)
     step = np.zeros((*q.shape, 4, 4))
-    step[..., 0, :] = np.stack([c, -s * ca, s * sa, arm.a * c], axis=-1)
-    step[..., 1, :] = np.stack([s, c * ca, -c * sa, arm.a * s], axis=-1)
+    step[..., 0, 0], step[..., 0, 1], step[..., 0, 2], step[..., 0, 3] = c, -s * ca, s * sa, arm.a * c
+    step[..., 1, 0], step[..., 1, 1], step[..., 1, 2], step[..., 1, 3] = s, c * ca, -c * sa, arm.a * s
     step[..., 2, 1], step[..., 2, 2], step[..., 2, 3] = sa, ca, arm.d
     step[..., 3, 3] = 1.0
-    frames = [np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))]
+    frames = np.empty((*q.shape[:-1], arm.joints + 1, 4, 4))
+    frames[..., 0, :, :] = np.eye(4)
     for i in range(arm.joints):
-        frames.append(frames[-1] @ step[..., i, :, :])
-    return np.stack(frames, axis=-3)
+        frames[..., i + 1, :, :] = frames[..., i, :, :] @ step[..., i, :, :]
+    return frames
 
 
 def flange(arm: Arm, q: Array) -> Array:
@@ -94,16 +95,31 @@ def velocity(arm: Arm, q: Array, v: Array) -> Array:
     return np.asarray(np.linalg.lstsq(_slope(q, arm, here), wanted, rcond=None)[0])
 
 
-def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
-    """(6, n) change of `_off` a radian of every joint; central differences, all joints at once."""
-    step = 1e-6
-    steps = np.eye(arm.joints) * step
-    off = _off(q + np.concatenate([steps, -steps]), arm, wanted)
-    return np.asarray((off[: arm.joints] - off[arm.joints :]).T / (2 * step))
-
-
 def _off(q: Array, arm: Arm, wanted: Array) -> Array:
-    """(..., 6) rotation (mm, at the lever) and position from the wanted flange to that at q (..., n)."""
+    """(6,) rotation (mm, at the lever) and position from the wanted flange to that at q (n,)."""
     T = flange(arm, q)
-    turn = Rotation.from_matrix(wanted[:3, :3].T @ T[..., :3, :3]).as_rotvec()
-    return np.concatenate([turn * _LEVER, T[..., :3, 3] - wanted[:3, 3]], axis=-1)
+    return np.concatenate([_turn(wanted, T) * _LEVER, T[:3, 3] - wanted[:3, 3]])
+
+
+def _slope(q: Array, arm: Arm, wanted: Array) -> Array:
+    """(6, n) change of `_off` a radian of every joint: each turns what follows about its own z axis."""
+    frames = links(arm, q)
+    axes = frames[:-1, :3, 2]
+    x, y, z = turn = _turn(wanted, frames[-1])
+    # What a small turn after another changes of the rotation vector.
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = np.sqrt(turn @ turn)
+    share = 1 / 12 if angle < 1e-3 else (1 - angle / 2 / np.tan(angle / 2)) / angle**2
+    turned = (np.eye(3) - across / 2 + share * across @ across) @ wanted[:3, :3].T @ axes.T
+    arms = frames[-1, :3, 3] - frames[:-1, :3, 3]
+    moved = axes[:, [1, 2, 0]] * arms[:, [2, 0, 1]] - axes[:, [2, 0, 1]] * arms[:, [1, 2, 0]]
+    return np.concatenate([turned * _LEVER, moved.T])
+
+
+def _turn(wanted: Array, T: Array) -> Array:
+    """Rotation vector (3,) rad from the wanted flange to another, in the wanted one's frame."""
+    R = wanted[:3, :3].T @ T[:3, :3]
+    across = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    sine = np.sqrt(across @ across)
+    angle = np.arctan2(sine, (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2)
+    return across * (angle / sine if sine > 1e-12 else 1.0)
