@@ -19,7 +19,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import chdir
 from copy import deepcopy
 from dataclasses import fields, is_dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module, util
 from multiprocessing import get_context
 from pathlib import Path
@@ -101,6 +101,14 @@ def test_the_package_alone_is_imported_at_once():
     assert float(run.stdout) <= 0.15
 
 
+@pytest.fixture(scope="module")
+def small_library(library_of):
+    """Few effects: what is tested is what holds them."""
+    with library_of(("joint_offset", "joint_compliance", "backlash", "range_scale")):
+        yield
+
+
+@pytest.mark.usefixtures("small_library")
 def test_the_example_of_the_package_runs(tmp_path, capsys):
     code = stitch.__doc__.split("\n", 1)[1]
     cell = measured_blade(0, views=6, mount="eye_in_hand", pixels=50)
@@ -120,6 +128,7 @@ DEAR = {"scipy.stats", "matplotlib", "rerun", "trimesh", "open3d", "dask", "dist
 LIGHT = DEAR | {"numpy", "scipy", "pyarrow", "asyncio"}
 
 
+@cache
 def loaded(code):
     """Modules of a process that has run some code."""
     told = f"import json, sys\n{code}\nprint('modules', json.dumps(list(sys.modules)))"
@@ -195,8 +204,11 @@ assert told > 25, told
     assert not loaded(code) & LIGHT
 
 
+PICTURES = "import viz.recording, viz.run_page, viz.sections, viz.two_runs_page"
+
+
 def test_an_arm_without_meshes_needs_no_library_of_meshes():
-    assert "trimesh" not in loaded("import viz.recording, viz.run_page")
+    assert "trimesh" not in loaded(PICTURES)
 
 
 def test_a_batch_on_one_process_needs_no_cluster():
@@ -204,7 +216,7 @@ def test_a_batch_on_one_process_needs_no_cluster():
 
 
 def test_page_recording_and_diagnosis_are_drawn_without_a_plotting_library():
-    assert "matplotlib" not in loaded("import viz.recording, viz.run_page, viz.sections, viz.two_runs_page")
+    assert "matplotlib" not in loaded(PICTURES)
 
 
 # What displays, cameras and their drivers bring to a machine, and a bare one lacks.
@@ -367,17 +379,10 @@ def members_of(value, depth=3):
 
 
 @pytest.fixture(scope="module")
-def small_library(library_of):
-    """Few effects: what is tested is what holds them."""
-    with library_of(("joint_offset", "joint_compliance", "backlash", "range_scale")):
-        yield
-
-
-@pytest.fixture(scope="module")
 def values(tmp_path_factory, small_library):
     """An object of every class that public names hand out, by its name: those that others hold are found there."""
     folder = tmp_path_factory.mktemp("values")
-    cell = measured_blade(0, views=8, mount="eye_in_hand", pixels=30)
+    cell = measured_blade(0, views=5, mount="eye_in_hand", pixels=30)
     clouds, poses = [cloud.points for cloud in cell.clouds], np.array(cell.T_base_flange)
     session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=False)
     batch = stitch.batch([session])

@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_synth import kinematics, nature
+from data_synth.fixtures.quiet_scenes import mesh_for
 from data_synth.moment import Plan
 from data_synth.planning import plan_views
 from data_synth.scanner import field_map
 from data_synth.scene import Scene, load_scene
-from data_synth.simulate import moments_of, part_mesh
+from data_synth.simulate import moments_of
 from data_synth.take_view import Cell, take_view
 from data_synth.write import cloud_file, robot_table
 from stitch.numerics import frames
@@ -58,7 +59,7 @@ def new_cell(folder: Path, seed: int) -> list[float]:
     columns: dict[str, list[object]] = {"view": []}
     session_files.write_session(folder, SessionFiles("driven", "mm", scene.mount, views=columns, tables=tables))
     (folder / "views.csv").unlink()
-    plan, _ = plan_views(scene, part_mesh(scene), 1, np.random.default_rng([seed, 1]))
+    plan, _ = plan_views(scene, mesh_for(scene), 1, np.random.default_rng([seed, 1]))
     return np.degrees(plan.joints[0]).tolist()
 
 
@@ -78,7 +79,7 @@ def take(folder: Path, view: str, joints: Array, seed: int, empty: bool = False)
     names_of = ("scanner_temperature_c", "part_temperature_c", "robot_temperature_c", "humidity_percent")
     still_air = dict.fromkeys(names_of, np.full(len(every), 25.0))
     moment = moments_of(scene, plan, 30.0 * np.arange(len(every)), still_air)[-1]
-    cell = Cell(scene, part_mesh(scene), laws, true_mount(scene, seed), weights, {})
+    cell = Cell(scene, mesh_for(scene), laws, true_mount(scene, seed), weights, {})
     cloud = take_view(cell, moment, 0.0, np.random.default_rng([seed, 5, len(names)])).cloud
     if not len(cloud.points):
         return False

@@ -52,15 +52,16 @@ def true_chain(measurement: Measurement, terms: Sequence[Term], base: TrueChain 
         axes = views.axes.as_read() if views.axes else None
         none = np.zeros((views.count, 6))
         base = TrueChain(views.joints, exact, none, none, none, axes)
-    # Copied, since a user's own effect may change the links that it is given.
-    links = Links(*(value.copy() for value in vars(base.links).values()))
-    chain = replace(base, links=links)
+    chain = base
     for term in terms:
         place, function, arguments = term.effect.place, term.effect.function, term.arguments
         if place in _CHANGED:
             # The function adds to what it is given; what it reads of the pose are the reported angles.
             name = _CHANGED[place]
-            chain = replace(chain, **{name: function(getattr(chain, name), views, **arguments)})
+            given = getattr(chain, name)
+            # Copied, since a user's own effect may change the links that it is given.
+            own = Links(*(value.copy() for value in vars(given).values())) if place == "links" else given
+            chain = replace(chain, **{name: function(own, views, **arguments)})
         elif place in _DISPLACED:
             chain = replace(chain, **{place: getattr(chain, place) + function(views, **arguments)})
     return chain

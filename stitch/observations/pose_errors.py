@@ -95,8 +95,8 @@ def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
     return [e for e in per_joint if not any(missing_need(m, e) for m in measurements)]
 
 
-def effect_twists(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
-    """Return left twists (6V, P) of the views about `centre`, for a plausible size of each parameter of some effects.
+def effect_twists(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> list[Array]:
+    """Return per effect the left twists (6V, P) of the views about `centre`, for a plausible size of each parameter.
 
     Rotation (rad) before translation (length_unit), view after view, by the derivative at `model`.
 
@@ -106,15 +106,16 @@ def effect_twists(measurement: Measurement, model: Model, centre: Array, effects
     in_use: dict[str, Term] = {term.name: term for term in model.terms}
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
     derivatives = pose_derivatives(measurement, model, terms, centre)
-    return np.hstack([d.reshape(len(d), -1).T * term.typical for term, d in zip(terms, derivatives, strict=True)])
+    return [d.reshape(len(d), -1).T * term.typical for term, d in zip(terms, derivatives, strict=True)]
 
 
 def _rig_twists(
     measurements: Sequence[Measurement], model: Model, centres: Sequence[Array], effects: Sequence[Effect]
-) -> Array:
+) -> list[Array]:
     """Return `effect_twists` (6V, P) of all views of a rig, session after session, each about its centre (3,)."""
     sessions = zip(measurements, centres, strict=True)
-    return np.concatenate([effect_twists(m, model, centre, effects) for m, centre in sessions])
+    by_session = [effect_twists(m, model, centre, effects) for m, centre in sessions]
+    return [np.concatenate(columns) for columns in zip(*by_session, strict=True)]
 
 
 def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
@@ -124,7 +125,7 @@ def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -
     """
     if not measurement.views.has("joints") or _OFFSET not in EFFECTS:
         return None
-    return effect_twists(measurement, model, centre, [EFFECTS[_OFFSET]])
+    return effect_twists(measurement, model, centre, [EFFECTS[_OFFSET]])[0]
 
 
 def usual_twist(length_unit: str) -> Array:
@@ -393,15 +394,16 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     shares_stop = block_diag(*(m.capture.shares_stop for m in measurements))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
-        for effect in arm_effects(measurements):
-            columns = _rig_twists(measurements, model, centres, [effect])
+        of_arm = arm_effects(measurements)
+        constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
+        twists = _rig_twists(measurements, model, centres, [*of_arm, *constant])
+        for effect, columns in zip(of_arm, twists, strict=False):
             effects[effect.name] = (EFFECT_FAMILY.get(effect.name, effect.name), columns)
         # Effects of one family share a size.
         for family in dict.fromkeys(family for family, _ in effects.values()):
             squares = [X @ X.T for of_effect, X in effects.values() if of_effect == family]
             components[family] = (np.sum(squares, axis=0), _ARM_SCALE)
-        constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
-        links = _rig_twists(measurements, model, centres, constant)
+        links = np.hstack(twists[len(of_arm) :])
         joint_kernel = rbf_joints(joints)
         components["smooth"] = (process_covariance(links, joint_kernel), SMOOTH_SCALE)
         if constant[0].name == _OFFSET:

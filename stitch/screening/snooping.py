@@ -425,16 +425,13 @@ def _log_evidence(z: Array, A: Array, fixed: Array, arm: Array, scatter: Array) 
         fixed: (n, n) covariance that is known.
         arm, scatter: (n, n) covariances that errors of the arm, and white scatter, add at their usual size.
     """
-    logs = list[float]()
-    squares = list[float]()
-    for arm_size, size in product(_ARM_SIZES, _SCATTERS):
-        C = fixed + arm_size**2 * arm + size**2 * scatter
-        CA = np.linalg.solve(C, A)
-        Cz = np.linalg.solve(C, z)
-        mean = A.T @ CA
-        square = float(z @ Cz - Cz @ A @ np.linalg.solve(mean, A.T @ Cz))
-        sizes = ((arm_size, *_ARM_PRIOR), (size, *_SCATTER_PRIOR))
-        prior = sum(-0.5 * (np.log(value / median) / spread) ** 2 for value, median, spread in sizes)
-        logs.append(prior - 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.slogdet(mean)[1] + square))
-        squares.append(square)
-    return float(logsumexp(logs)), min(squares)
+    arm_sizes, sizes = np.array(list(product(_ARM_SIZES, _SCATTERS))).T
+    C = fixed + arm_sizes[:, None, None] ** 2 * arm + sizes[:, None, None] ** 2 * scatter
+    solved = np.linalg.solve(C, np.column_stack([A, z]))  # (sizes, n, r + 1)
+    products = np.column_stack([A, z]).T @ solved
+    mean, along = products[:, :-1, :-1], products[:, :-1, -1:]
+    squares = products[:, -1, -1] - (along.transpose(0, 2, 1) @ np.linalg.solve(mean, along))[:, 0, 0]
+    by_prior = ((arm_sizes, *_ARM_PRIOR), (sizes, *_SCATTER_PRIOR))
+    prior = sum(-0.5 * (np.log(values / median) / spread) ** 2 for values, median, spread in by_prior)
+    logs = prior - 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.slogdet(mean)[1] + squares)
+    return float(logsumexp(logs)), float(squares.min())

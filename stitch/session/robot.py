@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stitch.numerics import frames
 from stitch.numerics.frames import Array
 
 # Columns of a frame.
@@ -228,26 +227,25 @@ def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
     Each error is a screw in a frame of the chain, expressed in the flange frame (Lynch & Park, *Modern Robotics*,
     5.1.2).
     """
-    chain = _chain(robot, joints, links)
-    T = chain[-1].end
+    # Of all links at once, (n, V, …).
+    before, turned, end, reach = (np.array(arrays) for arrays in zip(*_chain(robot, joints, links), strict=True))
     modified = robot.convention == "modified"
-    still = np.zeros((len(joints), 3))
-    scale = np.zeros((len(joints), 6))
-    slopes = dict[str, list[Array]](joints=[], lengths=[], da=[], dd=[], dalpha=[])
-    for link, factor in zip(chain, links.lengths.T, strict=True):
-        # Additions to a and d are lengths of the link: the factors multiply them too.
-        stretch = (links.scale * factor)[:, None]
-        row = link.before if modified else link.end  # the frame along whose x axis da and dalpha act
-        slopes["joints"].append(_screw(T, link.turned, link.turned[..., :3, _Z], still))
-        slopes["da"].append(_screw(T, row, still, stretch * row[..., :3, _X]))
-        slopes["dalpha"].append(_screw(T, row, row[..., :3, _X], still))
-        # d lies along z of the joint after its rotation, in the modified convention along z of the link's end.
-        along_d = (link.end if modified else link.turned)[..., :3, _Z]
-        slopes["dd"].append(_screw(T, link.end, still, stretch * along_d))
-        longer = _screw(T, link.end, still, link.reach)
-        scale += longer / links.scale[:, None]
-        slopes["lengths"].append(longer / factor[:, None])
-    return FlangeSlopes(scale=scale, **{name: np.stack(by_joint, axis=-1) for name, by_joint in slopes.items()})
+    T, still = end[-1], np.zeros_like(reach)
+    row = before if modified else end  # the frame along whose x axis da and dalpha act
+    # d lies along z of the joint after its rotation, in the modified convention along z of the link's end.
+    along_d = (end if modified else turned)[..., :3, _Z]
+    # Additions to a and d are lengths of the link: the factors multiply them too.
+    stretch = (links.scale[:, None] * links.lengths).T[..., None]
+    longer = _screws(T, end, still, reach)
+    slopes = {
+        "joints": _screws(T, turned, turned[..., :3, _Z], still),
+        "lengths": longer / links.lengths.T[..., None],
+        "da": _screws(T, row, still, stretch * row[..., :3, _X]),
+        "dd": _screws(T, end, still, stretch * along_d),
+        "dalpha": _screws(T, row, row[..., :3, _X], still),
+    }
+    scale = longer.sum(axis=0) / links.scale[:, None]
+    return FlangeSlopes(scale=scale, **{name: np.stack([*by_joint], axis=-1) for name, by_joint in slopes.items()})
 
 
 class _Link(NamedTuple):
@@ -289,15 +287,15 @@ def _scaled(T: Array, scale: Array) -> Array:
     return out
 
 
-def _screw(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
-    """Return twists (V, 6) of the flange, in its frame, by a rotation and a shift at another frame of the chain.
+def _screws(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
+    """Return twists (n, V, 6) of the flange, in its frame, by rotations and shifts at other frames of the chain.
 
     Args:
         T_base_flange: (V, 4, 4).
-        at: (V, 4, 4) T_base_frame; its origin is what the rotation is about.
-        turn, shift: (V, 3) rad and length_unit, base frame.
+        at: (n, V, 4, 4) T_base_frame; their origins are what the rotations are about.
+        turn, shift: (n, V, 3) rad and length_unit, base frame.
     """
-    lever = T_base_flange[:, :3, 3] - at[:, :3, 3]
-    back = frames.inverse(T_base_flange)
-    moved = (turn, np.cross(turn, lever) + shift)
-    return np.concatenate([frames.rotate(back, part[:, None])[:, 0] for part in moved], axis=1)
+    lever = T_base_flange[:, :3, 3] - at[..., :3, 3]
+    moved = np.stack([turn, np.cross(turn, lever) + shift], axis=-2)
+    # Rows times the rotation of the flange: its inverse turns them.
+    return (moved @ T_base_flange[:, :3, :3]).reshape(*turn.shape[:-1], 6)

@@ -3,6 +3,7 @@
 import json
 from concurrent.futures import CancelledError
 from dataclasses import replace
+from functools import cache
 from threading import current_thread
 
 import numpy as np
@@ -36,6 +37,7 @@ from viz.recording import run_markdown
 OFFSET = np.array([0, 1e-3, -1.5e-3, 4e-4, 2e-3, 0])
 
 
+@cache
 def arm_of(seed, views=40):
     """What a session with its own mount says about the arm."""
     session, *_ = labelled_cell(seed, views=views, offset=OFFSET)

@@ -31,10 +31,11 @@ def test_stock_on_half_of_the_part_is_said_and_the_view_stays(tmp_path):
     assert found.left_out == ()
     assert "v008 shows its surface" in found.doubts[0] and "outside" in found.doubts[0]
     found.save(tmp_path / "run", recording=False)
-    (again,) = (s for s in stitch.load_run(tmp_path / "run").measurement.capture.scans if s.stock is not None)
+    read = stitch.load_run(tmp_path / "run")
+    (again,) = (s for s in read.measurement.capture.scans if s.stock is not None)
     assert again.stock.thickness == pytest.approx(scan.stock.thickness)
     assert np.mean(again.stock.points == scan.stock.points) > 0.98
-    stitch.load_run(tmp_path / "run").save(tmp_path / "again", recording=False)
+    read.save(tmp_path / "again", recording=False)
     (row,) = json.loads((tmp_path / "again" / "result.json").read_text(encoding="utf-8"))["stock"]
     middle = frames.transform(found.poses[VIEW], scan.points.mean(axis=0)[None])[0]
     to_middle = frames.make(np.eye(3), -middle)

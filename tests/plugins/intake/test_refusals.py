@@ -4,6 +4,7 @@ import ast
 import json
 import shlex
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,12 @@ STEPS = 3
 STATED = {"rotation": "xyz-extrinsic", "angles": "rad", "unit": "mm", "cloud_unit": "mm", "mount": "eye_to_hand"}
 STATED |= {"inverse": "no"}
 TABLE = "RobotPoses.dat"
+
+
+@cache
+def small_cell():
+    """A cell of which the scans overlap."""
+    return measured_blade(3, 8, "eye_in_hand", (0.0, 0.0), pixels=50)
 
 
 def lines(change_lines):
@@ -116,7 +123,7 @@ def moved_scans(move):
 
     def spoil(folder):
         for i, (file, T) in enumerate(zip(sorted(folder.glob("*.ply")), poses_of(folder), strict=True)):
-            points = move(i, T @ CELL.T_mount, read_cloud(file).points)
+            points = move(i, T @ small_cell().T_mount, read_cloud(file).points)
             file.unlink()
             np.save(file.with_suffix(".npy"), points)
 
@@ -168,7 +175,6 @@ def workbook(*sheets):
     return spoil
 
 
-CELL = measured_blade(3, 8, "eye_in_hand", (0.0, 0.0), pixels=50)
 SHEAR = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.1, 0.0, 1.0]])
 # Of the part in the base, mm.
 MIDDLE = (0.0, 0.0, 0.0)
@@ -328,7 +334,7 @@ def refusing_functions():
 def overlapping(tmp_path_factory):
     """A folder that is right, of scans that overlap."""
     folder = tmp_path_factory.mktemp("overlapping")
-    write_session(folder / "cell", CELL, "cell")
+    write_session(folder / "cell", small_cell(), "cell")
     return raw_folder(folder / "cell", folder / "raw", Convention())
 
 
