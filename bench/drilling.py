@@ -5,7 +5,6 @@ compensate, turn upright, with `measure` in place of robot and sensors.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,14 +38,6 @@ HIDDEN = ((0.0, 0.0), (-0.004, 0.0), (0.0, 0.4), (-0.004, 0.4))
 IMAGES = 5
 
 
-@dataclass(frozen=True)
-class DrilledGroup:
-    """One group after compensation."""
-
-    moves: list[int]  # of the servo loop on each reference hole
-    drives: dict[str, Array]  # T_base_tool (4, 4) of the holes to drill
-
-
 def calibrated_sensors(cell: DrillingCell) -> tuple[FlangeSensors, Array, Array]:
     """Sensors from the cell's nine-hole plate and its planes, and the plate itself: (9, 3), (9, 2)."""
     xyz, uv = cell.plate()
@@ -57,8 +48,11 @@ def calibrated_sensors(cell: DrillingCell) -> tuple[FlangeSensors, Array, Array]
 
 def run_group(
     cell: DrillingCell, sensors: FlangeSensors, references: Sequence[str], targets: Sequence[str]
-) -> DrilledGroup:
+) -> tuple[list[int], dict[str, Array]]:
     """Servo onto the references, compensate the targets, then turn each target upright by the rangers.
+
+    Returns:
+        The moves of the servo loop on each reference hole, and T_base_tool (4, 4) of the holes to drill.
 
     Raises:
         NoResultError: a servo loop does not converge, or the references fix no rigid motion.
@@ -75,7 +69,7 @@ def run_group(
         name: turn_upright(_looker(cell, sensors, name), drive_pose(position, direction))
         for name, position, direction in zip(targets, positions, directions, strict=True)
     }
-    return DrilledGroup(moves, drives)
+    return moves, drives
 
 
 def _looker(cell: DrillingCell, sensors: FlangeSensors, name: str) -> Callable[[Array], HoleSight]:
@@ -97,10 +91,10 @@ def _experiment(job: Row) -> Row:
     errors: tuple[list[list[float]], list[list[float]]] = ([], [])
     steps = []
     for references, targets in GROUPS.values():
-        group = run_group(cell, sensors, references, targets)
-        steps += group.moves
+        moves, drives = run_group(cell, sensors, references, targets)
+        steps += moves
         for name in targets:
-            for rows, T in zip(errors, (drive_pose(*cell.nominal[name]), group.drives[name]), strict=True):
+            for rows, T in zip(errors, (drive_pose(*cell.nominal[name]), drives[name]), strict=True):
                 sight = sensors.see(*cell.measure(name, T))
                 rows.append([*map(float, cell.errors(name, T)), sight.in_plane])
     left_out = np.linalg.norm(leave_one_out(xyz[:, :2], uv), axis=1).mean()

@@ -13,7 +13,7 @@ from data_synth.planning import plan_views
 from data_synth.scanner import Cloud, field_map
 from data_synth.scene import Scene
 from data_synth.shapes import build_shape, load_mesh
-from data_synth.take_view import Cell, Taken, on_rail, take_view
+from data_synth.take_view import Cell, on_rail, take_view
 from stitch.numerics import frames
 from stitch.system.threads import parallel
 
@@ -79,7 +79,13 @@ def simulate(
     moments = moments_of(scene, plan, times, covariates)
     targets = targets_of(scene)
     true_cell = Cell(scene, mesh, laws, T_mount=T_mount, field_weights=field_weights, targets=targets)
-    taken = _take_all(true_cell, moments, rail, _stream_key(seed, 4, day))
+    stream = _stream_key(seed, 4, day)
+
+    def take(moment: Moment) -> tuple[Cloud, Array, Array]:
+        """Take a view from its own stream of chance."""
+        return take_view(true_cell, moment, rail[moment.index], np.random.default_rng([*stream, moment.index]))
+
+    clouds, T_reference_scanner, labelled = zip(*parallel(take, moments, "taking views"), strict=True)
     return Measured(
         scene=scene,
         mesh=mesh,
@@ -90,11 +96,11 @@ def simulate(
         approach=np.array([m.approach for m in moments]),
         T_base_flange=on_rail(kinematics.flange(scene.arm, plan.joints), rail),
         T_coarse=_coarse(scene, T_mount, cell),
-        clouds=[t.cloud for t in taken],
-        labelled={name: np.array([t.labelled[i] for t in taken]) for i, name in enumerate(targets)},
+        clouds=list(clouds),
+        labelled={name: np.array([seen[i] for seen in labelled]) for i, name in enumerate(targets)},
         hidden=hidden_parameters,
         T_mount=T_mount,
-        T_reference_scanner=np.array([t.T_reference_scanner for t in taken]),
+        T_reference_scanner=np.array(T_reference_scanner),
         targets={name: frames.transform(scene.T_reference_part, p[None])[0] for name, p in targets.items()},
     )
 
@@ -106,15 +112,6 @@ def _stream_key(seed: int, of: int, day: int) -> list[int]:
 
 def _stream(seed: int, of: int, day: int) -> np.random.Generator:
     return np.random.default_rng(_stream_key(seed, of, day))
-
-
-def _take_all(cell: Cell, moments: list[Moment], rail: Array, stream: list[int]) -> list[Taken]:
-    """All views, each from its own stream of chance."""
-
-    def take(moment: Moment) -> Taken:
-        return take_view(cell, moment, rail[moment.index], np.random.default_rng([*stream, moment.index]))
-
-    return list(parallel(take, moments, "taking views"))
 
 
 def moments_of(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Array]) -> list[Moment]:

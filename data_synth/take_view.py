@@ -29,17 +29,13 @@ class Cell:
     targets: dict[str, Array]  # (3,) each, part frame
 
 
-@dataclass(frozen=True)
-class Taken:
-    """One view as it was measured, and where the scanner truly stood."""
+def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator) -> tuple[Cloud, Array, Array]:
+    """Take one view with the base at `rail` (mm).
 
-    cloud: Cloud
-    T_reference_scanner: Array  # (4, 4)
-    labelled: Array  # (L, 3) targets in the sensor frame, NaN where not seen
-
-
-def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator) -> Taken:
-    """Take one view with the base at `rail` (mm)."""
+    Returns:
+        The cloud, T_reference_scanner (4, 4) where the scanner truly stood, and the labelled targets (L, 3) in its
+        frame, NaN where not seen.
+    """
     scene, laws = cell.scene, cell.laws
     sigma = np.array([scene.repeatability[0]] * 3 + [scene.repeatability[1]] * 3)
     scatter = frames.exp(rng.standard_normal(6) * sigma)
@@ -70,7 +66,7 @@ def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator)
         ideal = scan(surface, to_part @ poses, scene.scanner, cell.field_weights, rng)
         cloud = laws.act("points", moment, ideal)
     labelled = _labelled(cell, moment, frames.inverse(T_reference_scanner) @ T_reference_part, rng)
-    return Taken(cloud, T_reference_scanner, labelled)
+    return cloud, T_reference_scanner, labelled
 
 
 def _labelled(cell: Cell, moment: Moment, T_scanner_part: Array, rng: np.random.Generator) -> Array:

@@ -80,7 +80,7 @@ def take(folder: Path, view: str, joints: Array, seed: int, empty: bool = False)
     still_air = dict.fromkeys(names_of, np.full(len(every), 25.0))
     moment = moments_of(scene, plan, 30.0 * np.arange(len(every)), still_air)[-1]
     cell = Cell(scene, mesh_for(scene), laws, true_mount(scene, seed), weights, {})
-    cloud = take_view(cell, moment, 0.0, np.random.default_rng([seed, 5, len(names)])).cloud
+    cloud, *_ = take_view(cell, moment, 0.0, np.random.default_rng([seed, 5, len(names)]))
     if not len(cloud.points):
         return False
     (folder / "clouds").mkdir(exist_ok=True)

@@ -8,7 +8,7 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
+from data_synth.fixtures.labelled_arm import TABLE, TARGETS, labelled_cell
 from stitch.api.pipeline import change, diagnose, run
 from stitch.api.stepwise import suggest
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
@@ -176,7 +176,7 @@ def test_an_honest_cell_is_adequate():
 def test_growth_is_found_wherever_the_part_is_held(mount):
     """No session says which point of a part stands still; the flange and the robot's base need not be near it."""
     still = TARGETS[0] + [80.0, -40.0, -90.0] + (0 if mount == "eye_to_hand" else TABLE)
-    session, *_ = labelled_cell(4, mount=mount, grown=Growth(2e-4, still))
+    session, *_ = labelled_cell(4, mount=mount, grown=(2e-4, still))
     found = run(session)
     assert diagnose(found).effects == ("part_growth",)
     found = run(session, effects=["part_growth"])

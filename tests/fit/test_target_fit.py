@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from data_synth.fixtures.labelled_arm import PROBE_TURN, TARGETS, Growth, flange, labelled_cell, random_pose
+from data_synth.fixtures.labelled_arm import PROBE_TURN, TARGETS, flange, labelled_cell, random_pose
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api.pipeline import diagnose, run, run_rig
 from stitch.effects.contract import EFFECTS
@@ -138,7 +138,7 @@ def test_nominal_targets_pull_by_their_sigma(tmp_path):
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
 def test_a_view_that_shows_nothing_only_says_where_the_arm_was(mount):
-    session, T_mount, *_ = labelled_cell(6, mount=mount, grown=Growth(0.0, 0.0))
+    session, T_mount, *_ = labelled_cell(6, mount=mount, grown=(0.0, 0.0))
     blank = replace(session, views=tuple(replace(v, sighting=None) if k in (0, 7) else v
                                          for k, v in enumerate(session.views)))  # fmt: skip
     angle, distance = off(run(blank).T_mount, T_mount)

@@ -288,7 +288,7 @@ def experiment(seed):
     before, after = [], []
     for references, targets in GROUPS.values():
         before += [cell.errors(name, drive_pose(*cell.nominal[name])) for name in targets]
-        drives = run_group(cell, sensors, references, targets).drives
+        _, drives = run_group(cell, sensors, references, targets)
         after += [cell.errors(name, drives[name]) for name in targets]
     return np.array(before), np.array(after)
 

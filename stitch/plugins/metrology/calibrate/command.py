@@ -146,15 +146,14 @@ def robot(
         first = run(loaded)
         calibrated_robot_of_run(first)
         found, lines, diagnosis = suggest(first, at_most)
-        proved = keep_what_holds(found or first, others)
-    result = proved.run
+        result, proved = keep_what_holds(found or first, others)
     target = output or Path("runs") / f"{loaded.name}-robot"
     with new_folder(target, [session], force) as scratch:
         write_with_page(result, scratch)
         table = link_table(loaded, others)
-        write_robot(table, result, scratch, proved.sentences)
+        write_robot(table, result, scratch, proved)
         write_diagnosis(diagnosis, result, scratch)
-    document = robot_document(result, table, lines, diagnosis.sentence, proved.sentences)
+    document = robot_document(result, table, lines, diagnosis.sentence, proved)
     if as_json:
         emit(to_json(document))
     else:

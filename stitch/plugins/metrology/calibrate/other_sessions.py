@@ -47,24 +47,8 @@ class Proof:
         return f"On session {self.session}, which took no part, it leaves {here}, the nominal arm {nominal}."
 
 
-@dataclass(frozen=True)
-class ProvedArm:
-    """The run with those effects of its arm that hold on all sessions, and what became of the others."""
-
-    run: RunData
-    proofs: tuple[Proof, ...]
-    taken_out: tuple[str, ...]  # a sentence each
-
-    @property
-    def sentences(self) -> list[str]:
-        """What was proved where."""
-        if not self.proofs:
-            return [UNASKED]
-        return [*self.taken_out, *(proof.sentence for proof in self.proofs)]
-
-
-def keep_what_holds(calibrated: RunData, others: Sequence[SessionData]) -> ProvedArm:
-    """Return the run without the effects of its arm that make another session worse, the rest fitted anew.
+def keep_what_holds(calibrated: RunData, others: Sequence[SessionData]) -> tuple[RunData, list[str]]:
+    """Return the run with those effects of its arm that hold on all sessions, fitted anew, and what was proved where.
 
     Raises:
         InputError: a session without a robot, or with another.
@@ -91,7 +75,8 @@ def keep_what_holds(calibrated: RunData, others: Sequence[SessionData]) -> Prove
             f"leaves {with_it} with it and {without} without."
         )
         here, left = less, rest
-    return ProvedArm(here, _proofs(others, left, nominal), tuple(taken_out))
+    proofs = [proof.sentence for proof in _proofs(others, left, nominal)]
+    return here, [*taken_out, *proofs] or [UNASKED]
 
 
 def prove(arm: ModelFile, others: Sequence[SessionData]) -> tuple[Proof, ...]:

@@ -12,7 +12,7 @@ import pytest
 from data_synth import kinematics
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.labelled_arm import Growth, labelled_cell
+from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import write_session
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import candidates_of
@@ -107,7 +107,7 @@ def test_where_there_is_no_hand_eye_yet_as_many_views_are_chosen_as_are_asked_fo
 
 def test_views_not_taken_yet_come_after_those_that_were():
     """Temperatures count from the session's first view, an event before them has happened, a scan at rest has no delay."""
-    session, *_ = labelled_cell(2, views=9, grown=Growth(0.0, 0.0))
+    session, *_ = labelled_cell(2, views=9, grown=(0.0, 0.0))
     speeds = {f"j{i + 1}_velocity_deg_s": 5.0 for i in range(6)}
     session = replace(session, views=tuple(replace(v, covariates=v.covariates | speeds) for v in session.views))
     measurement = measurement_of(session, prepare_capture(session))
