@@ -114,7 +114,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         rival_trend=evidence.rival_trend if evidence.named else "",
         places=evidence.reported_places,
         beyond_belief=too_large(evidence.named),
-        together=_named_together(evidence),
+        together=evidence.missing_together,
         tried=state.tried,
         budget=budget.result(),
         answers=evidence.answers,
@@ -176,13 +176,6 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
         )
 
     return list(parallel(examined, range(len(scores)), "candidate effects on views left out"))
-
-
-def _named_together(evidence: Evidence) -> tuple[str, ...]:
-    """Return the effects that are missing side by side, the named one first; otherwise the effects that are named."""
-    named = tuple(r.name for r in evidence.named)
-    together = tuple(r.name for r in evidence.together)
-    return together if evidence.verdict == "missing_effect" and together[:1] == named else named
 
 
 def _pair_beside_each_other(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Ranked] | None:

@@ -25,6 +25,7 @@ and of a joint the mean of its kinds.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from operator import attrgetter
 
 import numpy as np
 from scipy.special import logsumexp
@@ -80,6 +81,7 @@ _FOLLOWED = {
     JOINT_LOAD: "its load",
 }
 _DEGREES = float(np.degrees(1.0))
+_EVIDENCE = attrgetter("log_bayes_factor")
 _CURVE_POINTS = 25  # over the range of the covariate
 # Covariances below this are none: such a factor of a product cannot be divided out of it.
 _NO_COVARIANCE = 1e-290
@@ -150,7 +152,7 @@ def joint_effects(base: LinearModel) -> tuple[JointEffect, ...]:
     several functions of a kind, as for each other joint, the likeliest stands for all, with their mean Bayes factor.
     Sizes are fitted, for which `log_posterior_of_any` charges. () without joints, or where pose errors have no prior.
     """
-    effects = sorted(_effects_at_null_variances(base), key=lambda effect: -effect.log_bayes_factor)
+    effects = sorted(_effects_at_null_variances(base), key=_EVIDENCE, reverse=True)
     # All variances are fitted again for the likeliest few. The others keep a lower bound: their gain without that.
     for k, effect in enumerate(effects[: limits.JOINT_EFFECTS_FITTED]):
         null = effect.model.null
@@ -160,12 +162,12 @@ def joint_effects(base: LinearModel) -> tuple[JointEffect, ...]:
         by_kind.setdefault((effect.joint, effect.follows), []).append(effect)
     likeliest = [
         replace(
-            max(of_kind, key=lambda effect: effect.log_bayes_factor),
+            max(of_kind, key=_EVIDENCE),
             log_bayes_factor=float(log_mean_exp([effect.log_bayes_factor for effect in of_kind])),
         )
         for of_kind in by_kind.values()
     ]
-    return tuple(sorted(likeliest, key=lambda effect: -effect.log_bayes_factor))
+    return tuple(sorted(likeliest, key=_EVIDENCE, reverse=True))
 
 
 def _effects_at_null_variances(base: LinearModel) -> Iterator[JointEffect]:

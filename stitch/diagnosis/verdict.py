@@ -120,6 +120,12 @@ class Evidence:
         return self.further if self.named else None
 
     @property
+    def missing_together(self) -> tuple[str, ...]:
+        """The effects that are missing side by side, the named one first; otherwise the effects that are named."""
+        named, together = (tuple(r.name for r in effects) for effects in (self.named, self.together))
+        return together if self.verdict == "missing_effect" and together[:1] == named else named
+
+    @property
     def log_odds_over_nothing(self) -> float:
         """Log odds of the name, or of one of the group, over nothing being missing; infinite where none is given."""
         odds = [r.log_odds_over_nothing for r in self.named]
