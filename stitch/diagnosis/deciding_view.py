@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stitch.diagnosis.candidate_views import (
     candidate_measurement,
@@ -78,21 +79,19 @@ _WAITS = (0.0, 0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival predicts that N further views show: m numbers each, jointly normal, their covariance in three parts.
+    """What a rival predicts that N further views show: m numbers each, jointly normal.
 
     The m numbers of a view are the six of its twist (surfaces), or the reduced residuals of its targets.
     """
 
     mean: Array  # (N, m)
-    coefficient_root: Array  # (N, m, q) root of the covariance by coefficients that the views taken leave uncertain
-    shared: Array | None  # (N, m, N, m) covariance of pose errors; None: independent between views
-    per_view: Array  # (N, m, m) covariance of what is independent between views, as noise
+    covariance: Array  # (N, m, N, m) by what the views taken leave uncertain: coefficients, pose errors, noise
     design: Array  # (N, m, a) of hand-eye and effects in use
 
     def of_sets(self, chosen: Sequence[int], last: Indices) -> tuple[Array, Array]:
         """Return mean (C, D) and covariance (C, D, D) of the D numbers that C sets of k views will show, view by view.
 
-        A set is the chosen views and one more, so that D = k m.
+        A set is the chosen views and one more, all different, so that D = k m.
 
         Args:
             chosen: indices (k − 1) of the views that are in every set.
@@ -100,17 +99,11 @@ class Prediction:
         """
         sets = np.column_stack([np.tile(np.array(chosen, np.int64), (len(last), 1)), last])
         C, k = sets.shape
-        m = self.mean.shape[1]
-        roots = self.coefficient_root[sets].reshape(C, k * m, -1)
-        covariance = roots @ roots.transpose(0, 2, 1)
-        # The same memory, view by view: what is added to the blocks is added to the covariance.
-        blocks = covariance.reshape(C, k, m, k, m)
-        # Indices with a slice between them put their axes first: (C, k, k, m, m), and (k, C, m, m).
-        if self.shared is not None:
-            blocks += self.shared[sets[:, :, None], :, sets[:, None, :]].transpose(0, 1, 3, 2, 4)
-        each = np.arange(k)
-        blocks[:, each, :, each] += self.per_view[sets].transpose(1, 0, 2, 3)
-        return self.mean[sets].reshape(C, k * m), covariance
+        numbers = k * self.mean.shape[1]
+        # Indices with a slice between them put their axes first: (C, k, k, m, m).
+        blocks = self.covariance[sets[:, :, None], :, sets[:, None, :]]
+        covariance = blocks.transpose(0, 1, 3, 2, 4).reshape(C, numbers, numbers)
+        return self.mean[sets].reshape(C, numbers), covariance
 
 
 def deciding_views(
@@ -255,8 +248,9 @@ def _choose(linear: LinearModel, forms: RivalForms, joints: Array) -> tuple[list
     share_alone = np.zeros(len(joints))
     while len(chosen) < min(MOST_VIEWS, len(joints)) and (not probability or probability[-1] < SURE):
         draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
-        _, shares = _simulate_decisions(predictions, forms, chosen, indices, draws)
-        shares[chosen] = -1.0
+        shares = np.full(len(joints), -1.0)
+        others = np.delete(indices, chosen)
+        _, shares[others] = _simulate_decisions(predictions, forms, chosen, others, draws)
         if not chosen:
             share_alone = shares
         k = int(shares.argmax())
@@ -442,12 +436,8 @@ class _FurtherScans:
             unnamed: a joint without a law, whose variance is the last one of `base`; None: none is there.
         """
         variances = base.null.variances
-        n = 6 * len(self.flange)
-        blocks = np.zeros((len(self.flange), 6, len(self.flange), 6))
-        each = np.arange(len(self.flange))
         white = np.repeat(np.maximum(variances[:NOISE], 1e-300), 3)
-        blocks[each, :, each] = (self.flange * white) @ self.flange.transpose(0, 2, 1)
-        out = blocks.reshape(n, n)
+        out = block_diag(*((self.flange * white) @ self.flange.transpose(0, 2, 1)))
         if self.errors is None or base.pose_errors is None:
             return out
         components = self.errors.restricted(base.pose_errors.causes).components
@@ -518,16 +508,12 @@ def _predict_scans(linear: LinearModel, rival: Score | JointEffect, scans: _Furt
     covariance = scans.error_covariance(base, unnamed)
     reduction = scans.surfaces.reduced_poses.reduction
     with_taken = scans.beside_taken(covariance[:, : reduction.shape[1]] @ reduction.T)
-    among_further = scans.beside_taken(scans.beside_taken(covariance).T)
-    mean, root, explained = _condition_on_views(base, rival, columns, with_taken)
     N = len(columns) // 6
-    return Prediction(
-        mean.reshape(N, 6),
-        root.reshape(N, 6, -1),
-        shared=(among_further - explained).reshape(N, 6, N, 6),
-        per_view=np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6)),
-        design=columns[:, : base.white_design.shape[1]].reshape(N, 6, -1),
-    )
+    noise = block_diag(*[scans.noise(base) + 1e-18 * np.eye(6)] * N)
+    among_further = scans.beside_taken(scans.beside_taken(covariance).T) + noise
+    mean, covariance = _condition_on_views(base, rival, columns, with_taken, among_further)
+    design = columns[:, : base.white_design.shape[1]].reshape(N, 6, -1)
+    return Prediction(mean.reshape(N, 6), covariance.reshape(N, 6, N, 6), design)
 
 
 def _used_columns(linear: LinearModel, both: Measurement, centre: Array) -> Array:
@@ -560,16 +546,16 @@ def _twists(measurement: Measurement, model: Model, term: Term, centre: Array) -
 
 
 def _condition_on_views(
-    base: LinearModel, scored: Score | JointEffect, columns: Array, with_taken: Array
-) -> tuple[Array, Array, Array]:
-    """Return the distribution of M further numbers given the views taken, for a linear model with coefficients.
+    base: LinearModel, scored: Score | JointEffect, columns: Array, with_taken: Array, errors: Array
+) -> tuple[Array, Array]:
+    """Return mean (M,) and covariance (M, M) of M further numbers given the views taken, for a rival.
 
-    It is the mean (M,), a root (M, q) of the covariance by the coefficients' uncertainty, and the covariance (M, M) by
-    pose errors that the views taken explain (Rasmussen & Williams 2006, eq. 2.42).
+    The numbers are columns · coefficients + errors (Rasmussen & Williams 2006, eq. 2.42).
 
     Args:
         columns: (M, q) of the further numbers: hand-eye and effects in use, then the rival's parameters.
-        with_taken: (M, n) their covariance with the reduced observations.
+        with_taken: (M, n) covariance of the errors with the reduced observations.
+        errors: (M, M) their covariance among each other.
     """
     white, precision = base.white_design, np.zeros(base.white_design.shape[1])
     if isinstance(scored, Score):
@@ -582,7 +568,8 @@ def _condition_on_views(
     root = unit[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
     coefficients = root @ (root.T @ (white.T @ base.white_z))
     mean = columns @ coefficients + white_covariance.T @ (base.white_z - white @ coefficients)
-    return mean, (columns - white_covariance.T @ white) @ root, white_covariance.T @ white_covariance
+    by_coefficients = (columns - white_covariance.T @ white) @ root
+    return mean, by_coefficients @ by_coefficients.T + errors - white_covariance.T @ white_covariance
 
 
 def _predict_targets(
@@ -611,12 +598,12 @@ def _predict_targets(
         reduced = reduction @ np.concatenate([rows.hand_eye, landmarks, in_use, moved[..., scored.form.keep]], axis=2)
         N, d, q = reduced.shape
         with_taken = np.zeros((N * d, len(base.white_z)))
-        mean, root, _ = _condition_on_views(base, scored, reduced.reshape(-1, q), with_taken)
-        per_view = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
+        errors = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
         for variance, of_flange in zip(base.flange_scatter(base.null), scattered, strict=True):
-            per_view += variance * (of_flange @ of_flange.transpose(0, 2, 1))
+            errors += variance * (of_flange @ of_flange.transpose(0, 2, 1))
+        mean, covariance = _condition_on_views(base, scored, reduced.reshape(-1, q), with_taken, block_diag(*errors))
         design = reduced[..., : base.white_design.shape[1]]
-        predictions.append(Prediction(mean.reshape(N, d), root.reshape(N, d, -1), None, per_view, design))
+        predictions.append(Prediction(mean.reshape(N, d), covariance.reshape(N, d, N, d), design))
     return predictions
 
 

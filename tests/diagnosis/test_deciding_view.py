@@ -46,7 +46,7 @@ JOINT = 2
 
 def prediction(mean, sigma):
     """Of one view with one number, which scatters alone."""
-    return Prediction(np.array([[mean]]), np.zeros((1, 1, 1)), None, np.full((1, 1, 1), sigma**2), np.zeros((1, 1, 0)))
+    return Prediction(np.array([[mean]]), np.full((1, 1, 1, 1), sigma**2), np.zeros((1, 1, 0)))
 
 
 def alike(count):
