@@ -27,7 +27,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import mean_square_share
 from stitch.numerics.parameter_selection import log_evidence
 from stitch.numerics.units import listed
-from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
+from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial, PointSums
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,7 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
     Returns:
         The ratio, and its standard error with folds as samples. Effects of points count by what they do to poses.
     """
-    a = linear.design.shape[1]
-    precision = np.concatenate([np.zeros(a), *(_precision_of_sizes(linear, scored)[a:] for scored in group)])
-    trial = linear.trial(np.hstack([linear.design, *(scored.form.response for scored in group)]))
-    priors = [CoefficientPrior(p, np.zeros(len(p))) for p in (precision, np.zeros(a))]
+    trial, priors = _with_and_without(linear, group)
     folds = linear.observation.folds
     scatter = [[trial.scatter(fold, x) for x in trial.solve_each(priors, fold)] for fold in folds]
     return mean_square_share(*np.array(scatter).reshape(-1, 2).T)
@@ -143,18 +140,12 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
 def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, Array, Array]:
     """Return the fit with a candidate, and what G folds of views leave when each is predicted by a fit without it.
 
-    If a fold carries most of an effect, the rest hardly shows it. So these fits have a prior: the effect is about as
-    large as with all views, of either sign. The model's other coefficients have none.
-
     Returns:
         The fit; sums of squares (2, G) of the folds' points, with the candidate and without; and (2, G) of their poses.
     """
     points = scored.candidate.points
     sums = None if points is None else points.select(scored.form.keep)
-    trial = linear.trial(np.hstack([linear.design, scored.form.response]), sums)
-    # Nothing is believed of the coefficients of the model as it is.
-    precisions = (_precision_of_sizes(linear, scored), np.zeros(linear.design.shape[1]))
-    priors = [CoefficientPrior(precision, np.zeros(len(precision))) for precision in precisions]
+    trial, priors = _with_and_without(linear, [scored], sums)
     squares, scatter = [], []
     for fold in linear.observation.folds:
         affected = linear.observation.affected_squares(fold)
@@ -164,14 +155,25 @@ def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, A
     return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
 
 
-def _precision_of_sizes(linear: LinearModel, scored: Score) -> Array:
-    """Return the prior's precisions (a + k,), 1/size², of a coefficients of the model and k of a candidate.
+def _with_and_without(
+    linear: LinearModel, group: Sequence[Score], sums: PointSums | None = None
+) -> tuple[LinearTrial, list[CoefficientPrior]]:
+    """Return a fit with candidates in the model, and the priors of one with them and of one without.
 
-    Those of the model are zero: no prior. A candidate's size is √(value² + sigma²) of its fit with all views.
+    If a fold carries most of an effect, the rest hardly shows it. So effects are believed to be about as large as with
+    all views, √(value² + sigma²), of either sign. Nothing is believed of the coefficients of the model as it is.
+
+    Args:
+        sums: over the points that the candidates move; None: they move none, or count by what they do to poses.
     """
-    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
-    size = np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes)
-    return np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
+    precision = np.zeros(linear.design.shape[1])
+    with_effects = [precision]
+    for scored in group:
+        size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
+        with_effects.append(1 / np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes) ** 2)
+    trial = linear.trial(np.hstack([linear.design, *(scored.form.response for scored in group)]), sums)
+    priors = [CoefficientPrior(p, np.zeros(len(p))) for p in (np.concatenate(with_effects), precision)]
+    return trial, priors
 
 
 def _steadiness(linear: LinearModel, trial: LinearTrial, response: Array) -> float:

@@ -363,16 +363,12 @@ class _CorrespondenceRows:
         ]
 
     def sums(self, bins: Indices, size: int) -> list[Array]:
-        """Return (size, V, V) counts, sums of e and of e² by bin, view and partner."""
-        key = (bins * self.count + self.view) * self.count + self.partner
-        length = size * self.count**2
-        weights = (None, self.residual, self.residual**2)
-        return [np.bincount(key, w, length).reshape(size, self.count, self.count).astype(float) for w in weights]
+        """Return (size, V) counts, sums of e and of e² by bin and view."""
+        return _sums_by_view(bins, size, self.view, self.count, self.residual, self.residual**2)
 
     def statistics(self, bins: Indices, size: int) -> BinStatistics:
         """Return what the views say of the means of so many bins."""
-        n, s, q = (x.sum(axis=2) for x in self.sums(bins, size))
-        return view_statistics(n, s, q, _ENOUGH)
+        return view_statistics(*self.sums(bins, size), _ENOUGH)
 
 
 class _OffsetRows:
@@ -414,11 +410,15 @@ class _OffsetRows:
         sums = np.stack([np.bincount(bins, self.offset[:, i], size) for i in range(3)], axis=1)
         mean = sums / np.maximum(count, 1)[:, None]
         direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
-        along = self.offset @ direction
-        key = bins * self.count + self.view
-        weights = (np.ones(len(along)), along, np.sum(self.offset**2, axis=1))
-        n, s, q = (np.bincount(key, w, size * self.count).reshape(size, self.count).astype(float) for w in weights)
-        return view_statistics(n, s, q, directions=_DIRECTIONS)
+        squares = np.sum(self.offset**2, axis=1)
+        sums = _sums_by_view(bins, size, self.view, self.count, self.offset @ direction, squares)
+        return view_statistics(*sums, directions=_DIRECTIONS)
+
+
+def _sums_by_view(bins: Indices, size: int, view: Indices, views: int, e: Array, squares: Array) -> list[Array]:
+    """Return (size, V) counts, and sums of e (N,) and of squares (N,), by bin and view of N rows."""
+    key = bins * views + view
+    return [np.bincount(key, w, size * views).reshape(size, views).astype(float) for w in (None, e, squares)]
 
 
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
@@ -431,11 +431,10 @@ def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
 def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     """Return the table of pairs of views that have correspondences: mean and rms of the distance, length_unit.
 
-    Sigmas and p-values are NaN, since a pair is a single sample. `rows.sums` are (1, V, V); both halves hold the same
-    correspondences, and the upper one counts v less w.
+    Sigmas and p-values are NaN, since a pair is a single sample. Both halves of `rows.sums` by partner and view hold
+    the same correspondences; where the view comes first they count v less w.
     """
-    one_bin = np.zeros(len(rows.view), np.int64)
-    counts, sums, squares = (by_bin[0] for by_bin in rows.sums(one_bin, 1))
+    counts, sums, squares = (by_partner.T for by_partner in rows.sums(rows.partner, len(names)))
     v, w = np.nonzero(np.triu(counts, 1))
     count = counts[v, w]
     unknown = np.full(len(v), np.nan)
