@@ -155,8 +155,8 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         contenders = [rescored_in(base, r) for r in contenders]
     ranked = _raise_hidden(evidence.ranked, first, contenders)
     laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
-    contenders = list(likeliest_first(case.dictionary.credited(r, laws) for r in contenders))
-    best = contenders[0]
+    credited = likeliest_first(case.dictionary.credited(r, laws) for r in contenders)
+    best = credited[0]
     rivals = case.dictionary.without(base, laws, best)
     unmodelled = max([unmodelled_log_posterior(base), *(r.log_posterior for r in rivals)])
     shapes = [r for r in (*evidence.empirical, *rivals) if stands_out(r)]
@@ -166,7 +166,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
         "explanation": (best,),
         "together": (best,),
         "shape": shape and (shape if shape in rivals else rescored_in(base, shape)),
-        "contenders": contenders,
+        "contenders": credited,
         "base": base,
         "unmodelled_log_posterior": unmodelled,
         "ranked": rescored_against(ranked, best, unmodelled),

@@ -318,9 +318,9 @@ def objection_in_halves(scored: Score) -> str | None:
         # What either half shows is what the views of the other do not explain.
         first, second = base.explained_without(second_views), base.explained_without(first_views)
         gains.append(_predictive_factor(scored, base, first, second) + _predictive_factor(scored, base, second, first))
-        halves = [_half_evidence(base, explained, scored.form) for explained in (first, second)]
-        p_values.append(_size_consistency(halves[0], halves[1], scored.form.sizes))
-        shares.append(_smaller_share(halves[0], halves[1], scored.form.sizes))
+        halves = _half_evidence(base, first, scored.form), _half_evidence(base, second, scored.form)
+        p_values.append(_size_consistency(*halves, scored.form.sizes))
+        shares.append(_smaller_share(*halves, scored.form.sizes))
     if np.mean(gains) <= 0:
         return f"{scored.name}, found in one half of the views, does not help in the other"
     # Bonferroni over the ways to halve. A clear effect whose form is not quite right differs a little, beyond chance:

@@ -362,7 +362,7 @@ class _CorrespondenceRows:
             ("field ρ", "", np.hypot(x, y) / z),
         ]
 
-    def sums(self, bins: Indices, size: int) -> list[Array]:
+    def sums(self, bins: Indices, size: int) -> tuple[Array, Array, Array]:
         """Return (size, V) counts, sums of e and of e² by bin and view."""
         return _sums_by_view(bins, size, self.view, self.count, self.residual, self.residual**2)
 
@@ -411,14 +411,17 @@ class _OffsetRows:
         mean = sums / np.maximum(count, 1)[:, None]
         direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
         squares = np.sum(self.offset**2, axis=1)
-        sums = _sums_by_view(bins, size, self.view, self.count, self.offset @ direction, squares)
-        return view_statistics(*sums, directions=_DIRECTIONS)
+        n, s, q = _sums_by_view(bins, size, self.view, self.count, self.offset @ direction, squares)
+        return view_statistics(n, s, q, directions=_DIRECTIONS)
 
 
-def _sums_by_view(bins: Indices, size: int, view: Indices, views: int, e: Array, squares: Array) -> list[Array]:
+def _sums_by_view(
+    bins: Indices, size: int, view: Indices, views: int, e: Array, squares: Array
+) -> tuple[Array, Array, Array]:
     """Return (size, V) counts, and sums of e (N,) and of squares (N,), by bin and view of N rows."""
     key = bins * views + view
-    return [np.bincount(key, w, size * views).reshape(size, views).astype(float) for w in (None, e, squares)]
+    n, s, q = (np.bincount(key, w, size * views).reshape(size, views).astype(float) for w in (None, e, squares))
+    return n, s, q
 
 
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
