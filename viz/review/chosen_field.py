@@ -1,4 +1,4 @@
-"""The field of disagreement of what was chosen in a plot: some views, bins of a property, a place of the part."""
+"""What a picture of the part shows of a choice in a plot: some views, targets, bins of a property, a place."""
 
 import base64
 import json
@@ -68,24 +68,56 @@ def patch_weights(rows: ResidualRows, part: str) -> PatchWeights:
     return PatchWeights(index, weight, len(points), radius)
 
 
-def chosen_field(
-    rows: ResidualRows, weights: PatchWeights, choice: Choice, comparison: dict[str, Any] | None, um: float
+def numbered_marks(rows: ResidualRows, part: str) -> Indices:
+    """(M, 2) view and target of the marks of a viewer's data (JSON), as numbers of the rows.
+
+    Raises:
+        InputError: data of a page that an older version wrote, or of another run.
+    """
+    data = json.loads(part)
+    try:
+        return np.array([_numbered(view, target, rows) for view, target in data["marks"]], np.int64)
+    except (KeyError, ValueError):
+        raise InputError(
+            "report.html: is not of this run as it stands; to fix: `stitch report RUN --no-diagnosis`"
+        ) from None
+
+
+def _numbered(view: str | None, target: str | None, rows: ResidualRows) -> tuple[int, int]:
+    if view is None and target is None:
+        return NOTHING, NOTHING
+    return (
+        ANY if view is None else rows.views.index(view),
+        ANY if target is None else rows.targets.index(target),
+    )
+
+
+def chosen_numbers(
+    rows: ResidualRows, shown: PatchWeights | Indices, choice: Choice, comparison: dict[str, Any] | None, um: float
 ) -> dict[str, Any]:
-    """The field and the numbers of a choice; plain data, errors in µm.
+    """What a picture shows of a choice, and its numbers; plain data, errors in µm.
 
     Args:
+        shown: weights of the patches whose field is shown, or (M, 2) marks of labelled points as `numbered_marks` has
+            them.
         comparison: compare.json, whose tables have the bins.
 
     Raises:
         InputError: a view, a target, a property or a bin that the run does not have.
     """
     mask = chosen_rows(rows, choice, comparison)
-    overall, e = _overall(rows, weights, mask) * um, rows.residual[mask] * um
-    seen = overall[np.isfinite(overall)]
-    return {
+    e = rows.residual[mask] * um
+    told = {
         "views": len(np.unique(rows.view[mask])),
         "correspondences": round(len(e) / rows.share),
         "rms": float(np.sqrt(np.mean(e**2))) if len(e) else None,
+    }
+    if not isinstance(shown, PatchWeights):  # distances of labelled points have no sign
+        values = mark_values(shown, rows.view[mask], rows.target[mask], e)
+        return told | {"signed": None, "mean": None, "values": packed_values(values)}
+    overall = _overall(rows, shown, mask) * um
+    seen = overall[np.isfinite(overall)]
+    return told | {
         "signed": float(e.mean()) if len(e) else None,
         "mean": float(seen.mean()) if len(seen) else None,
         "values": packed_values(overall),
@@ -149,54 +181,3 @@ def _in_bins(rows: ResidualRows, name: str, first: int, last: int, comparison: d
 
 def _floats(text: str) -> Array:
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 3).astype(float)
-
-
-# The picture and the numbers of what was chosen among labelled points: views, targets, bins of a property.
-
-
-def numbered_marks(rows: ResidualRows, part: str) -> Indices:
-    """(M, 2) view and target of the marks of a viewer's data (JSON), as numbers of the rows.
-
-    Raises:
-        InputError: data of a page that an older version wrote, or of another run.
-    """
-    data = json.loads(part)
-    try:
-        return np.array([_numbered(view, target, rows) for view, target in data["marks"]], np.int64)
-    except (KeyError, ValueError):
-        raise InputError(
-            "report.html: is not of this run as it stands; to fix: `stitch report RUN --no-diagnosis`"
-        ) from None
-
-
-def _numbered(view: str | None, target: str | None, rows: ResidualRows) -> tuple[int, int]:
-    if view is None and target is None:
-        return NOTHING, NOTHING
-    return (
-        ANY if view is None else rows.views.index(view),
-        ANY if target is None else rows.targets.index(target),
-    )
-
-
-def chosen_points(
-    rows: ResidualRows, marks: Indices, choice: Choice, comparison: dict[str, Any] | None, um: float
-) -> dict[str, Any]:
-    """Plain data as of a field, errors in µm; the values are those of the marks.
-
-    Args:
-        marks: (M, 2) as `numbered_marks` has them.
-        comparison: compare.json, whose tables have the bins.
-
-    Raises:
-        InputError: a view, a target, a property or a bin that the run does not have.
-    """
-    mask = chosen_rows(rows, choice, comparison)
-    distances = rows.residual[mask] * um
-    return {
-        "views": len(np.unique(rows.view[mask])),
-        "correspondences": len(distances),
-        "rms": float(np.sqrt(np.mean(distances**2))) if len(distances) else None,
-        "signed": None,
-        "mean": None,
-        "values": packed_values(mark_values(marks, rows.view[mask], rows.target[mask], distances)),
-    }

@@ -52,86 +52,78 @@ class ResidualRows:
         return {"range": far, "incidence": np.degrees(np.arccos(np.clip(cosine, -1, 1))), **field}
 
 
-def read_rows(run: Path, result: dict[str, Any]) -> ResidualRows | None:
-    """The rows of a run of clouds; None for labelled points alone.
+def read_rows(run: Path, result: dict[str, Any], labelled: bool) -> ResidualRows:
+    """The rows of a run of clouds; of labelled points alone, if they are all that it has.
 
     Args:
         result: result.json of the same run.
 
     Raises:
-        InputError: a damaged file.
+        InputError: a damaged file, or one without surfaces.
     """
+    wanted = ["view", "partner", *_COLUMNS]
     try:
         file = pq.ParquetFile(run / "residuals.parquet")
-        if not {"view", "partner", *_COLUMNS} <= set(file.schema_arrow.names):
-            return None
-        step = max(1, -(-file.metadata.num_rows // _AT_MOST))
+        if not set(wanted) <= set(file.schema_arrow.names):
+            raise InputError(f"{run}: has no surfaces to show a part of")
+        step = 1 if labelled else max(1, -(-file.metadata.num_rows // _AT_MOST))
         parts, left = [], 0
-        for batch in file.iter_batches(columns=["view", "partner", *_COLUMNS]):
+        for batch in file.iter_batches(columns=wanted):
             parts.append(batch.take(pa.array(np.arange(left, batch.num_rows, step))))
             left = (left - batch.num_rows) % step
-        table = pa.Table.from_batches(
-            parts, file.schema_arrow.empty_table().select(["view", "partner", *_COLUMNS]).schema
-        )
+        table = pa.Table.from_batches(parts, file.schema_arrow.empty_table().select(wanted).schema)
     except (OSError, pa.ArrowException) as error:
         raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
-    rows = _both_sides(table, result, 1 / step)
+    rows = (_sightings if labelled else _both_sides)(table, result, 1 / step)
     del parts, batch, table
     pa.default_memory_pool().release_unused()  # three times what the rows take
     return rows
 
 
-def read_sightings(run: Path, result: dict[str, Any]) -> ResidualRows:
-    """Every labelled point as a row: the 3D distance from its place, and where that is.
-
-    Args:
-        result: result.json of the same run.
-
-    Raises:
-        InputError: a damaged file.
-    """
-    try:
-        table = pq.read_table(run / "residuals.parquet", columns=["view", "partner", *_COLUMNS])
-    except (OSError, pa.ArrowException) as error:
-        raise InputError(f"{run}/residuals.parquet: cannot be read ({error}); run `stitch run` again") from None
-    names = tuple(row["view"] for row in result["views"])
-    number = {name: v for v, name in enumerate(names)}
-    values = np.column_stack([table[name].to_numpy() for name in _COLUMNS])
-    view = np.array([number[name] for name in table["view"].to_pylist()], np.int64)
-    poses = np.array([row["pose"] for row in result["views"]], float)
-    targets, target = np.unique(np.array(table["partner"].to_pylist(), str), return_inverse=True)
+def _sightings(table: pa.Table, result: dict[str, Any], share: float) -> ResidualRows:
+    """Every labelled point as a row: the 3D distance from its place, and where that is."""
+    names, poses, values = _views_and_values(table, result)
+    targets = tuple(sorted(set(table["partner"].to_pylist())))
     return ResidualRows(
         views=names,
-        view=view,
+        view=_numbers(table["view"], names),
         residual=values[:, 6],
         place=values[:, :3],
         normal=values[:, 3:6],
         poses=poses,
-        share=1.0,
-        targets=tuple(targets.tolist()),
-        target=target.astype(np.int64),
+        share=share,
+        targets=targets,
+        target=_numbers(table["partner"], targets),
     )
 
 
 def _both_sides(table: pa.Table, result: dict[str, Any], share: float) -> ResidualRows:
-    names = tuple(row["view"] for row in result["views"])
-    number = {name: v for v, name in enumerate(names)}
-    values = np.column_stack([table[name].to_numpy() for name in _COLUMNS])
+    names, poses, values = _views_and_values(table, result)
     e = values[:, 6]
     # As the rms of a run: what lies beyond the gate is an edge.
     inside = np.abs(e) < RMS_GATE * MAD_TO_SIGMA * float(np.median(np.abs(e))) if len(e) else np.zeros(0, bool)
-    sides = []
-    for side in ("view", "partner"):
-        told = table[side].combine_chunks()
-        of = np.array([number.get(name, -1) for name in told.dictionary.to_pylist()])
-        sides.append(of[told.indices.to_numpy()][inside])
     values, e = values[inside], e[inside]
     return ResidualRows(
         views=names,
-        view=np.concatenate(sides).astype(np.int64),
+        view=np.concatenate([_numbers(table[side], names)[inside] for side in ("view", "partner")]),
         residual=np.concatenate([e, -e]),
         place=np.vstack([values[:, :3]] * 2),
         normal=np.vstack([values[:, 3:6]] * 2),
-        poses=np.array([row["pose"] for row in result["views"]], float),
+        poses=poses,
         share=share,
     )
+
+
+def _views_and_values(table: pa.Table, result: dict[str, Any]) -> tuple[tuple[str, ...], Array, Array]:
+    """Names (V,) and poses (V, 4, 4) of the views, and the values (N, 7) of a table."""
+    names = tuple(row["view"] for row in result["views"])
+    poses = np.array([row["pose"] for row in result["views"]], float)
+    return names, poses, np.column_stack([table[name].to_numpy() for name in _COLUMNS])
+
+
+def _numbers(column: pa.ChunkedArray, names: tuple[str, ...]) -> Indices:
+    """(N,) where each text stands among the names; -1 where it does not."""
+    told = column.combine_chunks().dictionary_encode()
+    number = {name: i for i, name in enumerate(names)}
+    known = np.array([number.get(text, -1) for text in told.dictionary.to_pylist()], np.int64)
+    return known[told.indices.to_numpy()]

@@ -16,8 +16,8 @@ from stitch.numerics.frames import Indices
 from stitch.numerics.units import MICROMETRES
 from stitch.output.run_folder import restore_fit
 from stitch.system.files import whole_file
-from viz.review.chosen_field import Choice, PatchWeights, chosen_field, chosen_points, numbered_marks, patch_weights
-from viz.review.residual_rows import ResidualRows, read_rows, read_sightings
+from viz.review.chosen_field import Choice, PatchWeights, chosen_numbers, numbered_marks, patch_weights
+from viz.review.residual_rows import ResidualRows, read_rows
 from viz.review.run_snapshot import Snapshot, read_snapshot, version_of
 
 # The residuals of a model as a review keeps them, and what is asked of them.
@@ -25,12 +25,11 @@ from viz.review.run_snapshot import Snapshot, read_snapshot, version_of
 
 @dataclass(frozen=True)
 class KnownResiduals:
-    """Residuals of a model, how they count for the patches of the part, and the field of all of them."""
+    """Residuals of a model, what a picture of the part shows of them, and the numbers of all of them."""
 
     model: str
     rows: ResidualRows
-    weights: PatchWeights | None  # None of labelled points, which have marks
-    marks: Indices  # (M, 2) of labelled points
+    shown: PatchWeights | Indices  # marks (M, 2) of labelled points
     all: dict[str, Any]
 
     def chosen(self, choice: Choice, comparison: dict[str, Any] | None, um: float) -> dict[str, Any]:
@@ -39,11 +38,9 @@ class KnownResiduals:
         Raises:
             InputError: a view, a property or a bin that the run does not have.
         """
-        if self.weights is None:
-            return chosen_points(self.rows, self.marks, choice, comparison, um)
-        if choice.place is not None and not choice.within:
-            choice = replace(choice, within=2 * self.weights.radius)
-        return chosen_field(self.rows, self.weights, choice, comparison, um)
+        if isinstance(self.shown, PatchWeights) and choice.place is not None and not choice.within:
+            choice = replace(choice, within=2 * self.shown.radius)
+        return chosen_numbers(self.rows, self.shown, choice, comparison, um)
 
 
 def known_residuals(run: Path, found: Snapshot, um: float) -> KnownResiduals:
@@ -55,16 +52,14 @@ def known_residuals(run: Path, found: Snapshot, um: float) -> KnownResiduals:
     Raises:
         InputError: a damaged file, or a page without the part.
     """
-    everything, none = Choice(), np.zeros((0, 2), np.int64)
-    if found.state["labelled"]:
-        rows = read_sightings(run, found.result)
-        marks = none if found.part is None else numbered_marks(rows, found.part)
-        return KnownResiduals(found.model, rows, None, marks, chosen_points(rows, marks, everything, None, um))
-    told = read_rows(run, found.result)
-    if told is None or found.part is None:
+    labelled = found.state["labelled"]
+    rows = read_rows(run, found.result, labelled)
+    shown: PatchWeights | Indices = np.zeros((0, 2), np.int64)
+    if found.part is not None:
+        shown = (numbered_marks if labelled else patch_weights)(rows, found.part)
+    elif not labelled:
         raise InputError(f"{run}: has no surfaces to show a part of")
-    weights = patch_weights(told, found.part)
-    return KnownResiduals(found.model, told, weights, none, chosen_field(told, weights, everything, None, um))
+    return KnownResiduals(found.model, rows, shown, chosen_numbers(rows, shown, Choice(), None, um))
 
 
 # A person's own file in the run folder, which no command takes away.

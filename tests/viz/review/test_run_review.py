@@ -96,7 +96,7 @@ def test_a_damaged_file_is_named(run, name, text):
 def test_damaged_residuals_are_named(run):
     (run / "residuals.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match=r"residuals\.parquet"):
-        read_rows(run, json.loads((run / "result.json").read_text()))
+        read_rows(run, json.loads((run / "result.json").read_text()), labelled=False)
 
 
 def test_python_of_a_run_that_somebody_sent_waits_for_consent(run, tmp_path):
