@@ -23,7 +23,7 @@ from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.fit_report import fit_report
 from stitch.output.json_file import to_json
 from stitch.output.result_document import effects_source, ledger, points_of
-from stitch.output.run_folder import recordings, residual_table
+from stitch.output.run_folder import residual_table
 from stitch.output.stored_run import read_ledger
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import FusedCloud, RunData, StageResult
@@ -318,12 +318,14 @@ class Run(RunData):
         path = _save_session_of_run(whole, folder) if whole.in_memory else whole.path
         saved = replace(self, session=replace(self.session, path=path))
         with run_folder.new_folder(folder, [path], force) as scratch:
-            for recorder in recordings(scratch) if recording else []:
-                for call, arguments in self.recorded:
-                    getattr(recorder, call)(*arguments)
-                recorder.finish(saved)
-            run_folder.write_with_page(saved, scratch, tolerance)
+            run_folder.write_with_page(saved, scratch, tolerance, saved._tell if recording else None)
         return folder
+
+    def _tell(self, recorder: Recorder) -> None:
+        """Make all calls of the run on a recorder, to the last one."""
+        for call, arguments in self.recorded:
+            getattr(recorder, call)(*arguments)
+        recorder.finish(self)
 
     def plot(self, of: Literal["part", "error"] = "part") -> Any:
         """Return a matplotlib Figure: the part at every step of the model, coloured by how far its views disagree.

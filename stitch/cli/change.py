@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stitch.cli.options import EffectsFile, Json, Trust, complete_effect
-from stitch.cli.progress import opened_run, recorder_for, show_activity
+from stitch.cli.progress import Progress, opened_run, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
 from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
+    from stitch.recorder import RunMemory
     from stitch.run_data import RunData
 
 _AT_MOST = 5  # effects that --suggested adds one by one
@@ -109,11 +112,25 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
             result = with_prediction(result, _predicted_heldout(standing, state, effects))
             if note := _alternatives_note(standing, state, effects):
                 result = result.with_fit(notes=(note, *result.notes))
-            memory.replay_run(recorder_for(scratch, recording, run), result)
-            run_folder.write_with_page(result, scratch)
+            _write_changed(result, run, scratch, memory, recording)
     _show_changed(result, run, as_json)
     if not as_json:
         show_next(f"Next: stitch diagnose {shlex.quote(str(run))}")
+
+
+def _write_changed(result: RunData, run: Path, scratch: Path, memory: RunMemory, recording: bool) -> None:
+    """Show the progress of a change of the run in folder `run`, and write the changed run into a scratch folder.
+
+    Args:
+        memory: what recorders were told of it.
+        recording: write recording.rrd too, which continues that of the folder.
+    """
+    from stitch.output.run_folder import write_with_page
+
+    memory.replay_run(Progress(), result)
+    if recording and (run / "recording.rrd").is_file():
+        copyfile(run / "recording.rrd", scratch / "recording.rrd")
+    write_with_page(result, scratch, record=partial(memory.replay_run, run=result) if recording else None)
 
 
 def _predicted_heldout(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> float:
@@ -190,8 +207,7 @@ def _add_diagnosed(
             if not as_json:
                 _show_changed(result, run, as_json)
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
-                memory.replay_run(recorder_for(scratch, recording, run), result)
-                run_folder.write_with_page(result, scratch)
+                _write_changed(result, run, scratch, memory, recording)
             if as_json:
                 _show_changed(result, run, as_json)
         write_diagnosis(diagnosis, result or state, run)

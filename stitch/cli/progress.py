@@ -13,14 +13,12 @@ from contextlib import contextmanager
 from functools import cache
 from math import isfinite
 from pathlib import Path
-from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from stitch.system.process import AGAIN, QUIET
 
 if TYPE_CHECKING:
     from stitch.numerics.frames import Array
-    from stitch.recorder import Recorder
     from stitch.run_data import RunData, StageResult
     from stitch.session.session import SessionData
 
@@ -53,21 +51,6 @@ def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str)
         with show_activity(activity):
             state = stored_run.load_run(run, effects_file, trust=trust)
         yield state
-
-
-def recorder_for(folder: Path, recording: bool, earlier: Path | None = None) -> Recorder:
-    """Return a recorder that shows progress and, if asked for, writes recording.rrd into a folder.
-
-    Args:
-        earlier: run folder whose recording is copied first, so that the new one continues it; None: it begins anew.
-    """
-    from stitch.output.run_folder import recordings
-    from stitch.recorder import RecorderGroup
-
-    shown = recordings(folder) if recording else []
-    if shown and earlier is not None and (earlier / "recording.rrd").is_file():
-        copyfile(earlier / "recording.rrd", folder / "recording.rrd")
-    return RecorderGroup([Progress(), *shown])
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -27,7 +27,7 @@ from stitch.cli.options import (
     require_tolerance,
     split_names,
 )
-from stitch.cli.progress import live_line, recorder_for, show_activity
+from stitch.cli.progress import Progress, live_line, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show_next
 from stitch.errors import InputError
 from stitch.system.process import end_at_once, load_on_use
@@ -35,6 +35,7 @@ from stitch.system.process import end_at_once, load_on_use
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
     from stitch.model.model_toml import ModelFile
+    from stitch.recorder import Recorder
     from stitch.run_data import RunData
     from stitch.session.capture import Capture
     from stitch.session.session import SessionData
@@ -135,6 +136,7 @@ def run(
     from stitch.fusion.register import DEFAULT
     from stitch.output import json_file, run_folder
     from stitch.output.result_document import result_document
+    from stitch.recorder import RecorderGroup, RecorderMemory
     from stitch.session.scanners import have_own_hand_eyes
 
     name = "+".join(session.name for session in loaded)
@@ -142,19 +144,21 @@ def run(
     several_scanners = have_own_hand_eyes(loaded)
     inner = [""] if len(loaded) == 1 or several_scanners else [session.name for session in loaded]
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
-    run_folder.preload_entry_points("stitch.reports")
+    run_folder.preload_entry_points("stitch.reports", *(["stitch.recorders"] if recording else []))
     with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
         folders = [scratch / folder for folder in inner]
         for folder in folders:
-            folder.mkdir(exist_ok=True)  # recordings are written while the run goes on
-        recorders = [recorder_for(folder, recording) for folder in folders]
+            folder.mkdir(exist_ok=True)
+        memories = [RecorderMemory() for _ in folders]
+        recorders = [RecorderGroup([Progress(), memory]) for memory in memories]
+        records = [memory.replay if recording else None for memory in memories]
         if several_scanners:
             loaded, captures = [join_scanners(loaded, model, kept, captures)], None
         method = register or DEFAULT
         runs = run_rig(loaded, model, recorders, named, keep, kept, register=method, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         with ThreadPoolExecutor(1) as writer:
-            written = writer.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
+            written = writer.submit(_write_runs, runs, folders, records, scratch, mesh, tolerance)
             if not as_json:
                 _show_runs(runs, tolerance)
             mesh_fits = written.result()
@@ -335,20 +339,26 @@ def _given_models(
 
 
 def _write_runs(
-    runs: list[RunData], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
+    runs: list[RunData],
+    folders: list[Path],
+    records: Sequence[Callable[[Recorder], None] | None],
+    scratch: Path,
+    mesh: str | None,
+    tolerance: float | None,
 ) -> list[str]:
     """Write the run folders, with meshes if asked for, and return a sentence on how well each mesh fits its cloud.
 
     Args:
         folders: one a run, inside the scratch folder; of several runs `scratch` gets the common model.toml.
+        records: one a run, tells a recorder all of it; None: no recording is written.
         mesh: "open", "watertight" or "light"; None: none is made.
         tolerance: within which the views have to agree on the part, length_unit; None: not stated.
     """
     from stitch.output.run_folder import write_model_with_effects, write_with_page
 
     fits = []
-    for result, folder in zip(runs, folders, strict=True):
-        write_with_page(result, folder, tolerance)
+    for result, folder, record in zip(runs, folders, records, strict=True):
+        write_with_page(result, folder, tolerance, record)
         if mesh:
             from stitch.output.mesh import write_mesh
             from stitch.output.open3d_mesh import make_mesh

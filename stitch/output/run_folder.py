@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -309,19 +309,24 @@ def preload_entry_points(*groups: str) -> None:
     Thread(target=load, daemon=True).start()
 
 
-def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) -> None:
+def write_with_page(
+    run: RunData, folder: Path, tolerance: float | None = None, record: Callable[[Recorder], None] | None = None
+) -> None:
     """Write model.toml, result.json, ledger.json, stitched.ply, residuals.parquet and report.html into `folder`.
 
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
+        record: tells a recorder all of the run, to its end: for recording.rrd, which continues one that lies there.
+            None: it is not written.
     """
-    # The page, which takes longest, is made while all else is written.
-    with ThreadPoolExecutor(2) as threads:
+    # Page and recording, which take longest, are made while all else is written.
+    with ThreadPoolExecutor(3) as threads:
         page = threads.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
+        recording = threads.submit(_write_recording, folder, record)
         points = threads.submit(_write_points, run, folder)
         write_numbers(run, folder)
-        page.result()
-        points.result()
+        for written in (page, recording, points):
+            written.result()
 
 
 def write_numbers(run: RunData, folder: Path) -> None:
@@ -347,6 +352,13 @@ def write_model_with_effects(run: RunData, folder: Path) -> None:
     if source is not None:
         (folder / EFFECTS_FILE).write_text(source, encoding="utf-8")
     write_model(model_of(run), folder / "model.toml")
+
+
+def _write_recording(folder: Path, record: Callable[[Recorder], None] | None) -> None:
+    """Write recording.rrd into a folder by what `record` tells each recorder; None: nothing is written."""
+    if record is not None:
+        for recorder in recordings(folder):
+            record(recorder)
 
 
 def _write_points(run: RunData, folder: Path) -> None:

@@ -216,15 +216,15 @@ def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_aga
             recorder.finish(tried)
         return replace(fitted, tried={"backlash": "idle"}), [], None
 
-    def told_to(folder, recording, earlier):
+    def told_to(folder):
         own = SilentRecorder()
         own.iteration = lambda stage, index, *_: told_of.append((stage, index))
         own.finish = lambda run: told_of.append(run.tried)
-        return own
+        return [own]
 
     monkeypatch.setattr(pipeline, "change", None)
     monkeypatch.setattr(stepwise, "suggest", suggest)
-    monkeypatch.setattr("stitch.cli.change.recorder_for", told_to)
+    monkeypatch.setattr("stitch.output.run_folder.recordings", told_to)
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     monkeypatch.setattr("stitch.output.plain_finding.next_step_line", lambda found, run: "")
     stitch_command("add", run, "--suggested")

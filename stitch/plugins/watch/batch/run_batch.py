@@ -23,10 +23,10 @@ from stitch.errors import BusyError, InputError, NoResultError, StitchError
 from stitch.numerics.units import MICROMETRES
 from stitch.output import run_folder
 from stitch.output.json_file import require_free, sessions_in, write_json
-from stitch.output.run_folder import call_entry_points, recordings
+from stitch.output.run_folder import call_entry_points
 from stitch.output.stored_run import read_ledger, read_result
 from stitch.plugins.watch.batch.cluster import joined_client, local_client, sessions_at_once
-from stitch.recorder import RecorderGroup
+from stitch.recorder import RecorderMemory
 from stitch.run_data import RunData
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, measured_files
 from stitch.session.reading.text_files import read_toml
@@ -253,9 +253,13 @@ def run_session(job: BatchJob) -> SessionRow:
             if batch is None:
                 session = load_session(job.session)
                 with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
-                    recorded = job.recording and not job.small
-                    result = run(session, recorder=RecorderGroup(recordings(scratch) if recorded else []))
-                    (run_folder.write_numbers if job.small else run_folder.write_with_page)(result, scratch)
+                    memory = RecorderMemory()
+                    result = run(session, recorder=memory)
+                    if job.small:
+                        run_folder.write_numbers(result, scratch)
+                    else:
+                        record = memory.replay if job.recording else None
+                        run_folder.write_with_page(result, scratch, record=record)
                     write_mark(job, content, scratch, uncertainty_at_part(result))
             # A worker may die between a run and its answer; the next finds a run of this batch.
             return finished_row(job, skipped=batch not in (None, job.batch))
