@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -40,11 +41,17 @@ def unbroken(text: str) -> str:
 
 def render(template: str, **content: object) -> str:
     """A template of `viz/templates` filled in; text is escaped, and numbers stay with their units."""
+    return _environment().get_template(template).render(**content)
+
+
+@cache
+def _environment() -> Environment:
+    """The templates, each compiled once in a process."""
     environment = Environment(
         loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True, finalize=_on_one_line
     )
     environment.filters["script_json"] = lambda data: Markup(script_json(data))
-    return environment.get_template(template).render(**content)
+    return environment
 
 
 def _on_one_line(value: object) -> object:

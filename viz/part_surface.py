@@ -15,7 +15,7 @@ from stitch.output.mesh import TriangleMesh, mesh_of, spacing
 from stitch.run_data import FusedCloud
 from stitch.session.scan import even_indices
 from stitch.system.packages import unless_missing
-from stitch.system.threads import take_mapped
+from stitch.system.threads import remembered, take_mapped
 
 # From where the part is looked at: what is long stands upright, and the side that shows most comes to the front.
 
@@ -100,9 +100,9 @@ class PartShape(NamedTuple):
     triangles: Indices  # (T, 3)
 
 
-def part_surface(fused: FusedCloud, patches: Patches, shape: PartShape | None = None) -> PartSurface:
-    """The fused cloud as a mesh of what a screen can show, with the patches about it; `shape` if it is at hand."""
-    points, normals, triangles = part_shape(fused) if shape is None else shape
+def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
+    """The fused cloud as a mesh of what a screen can show, with the patches about it."""
+    points, normals, triangles = part_shape(fused)
     count = min(4 * _NEAREST, len(patches.points))
     distance, index = KDTree(np.ascontiguousarray(patches.points)).query(points, k=count)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1).astype(np.int64)
@@ -114,8 +114,9 @@ def part_surface(fused: FusedCloud, patches: Patches, shape: PartShape | None = 
     return PartSurface(points, normals, triangles, patch=index, weight=weight / weight.sum(axis=1, keepdims=True))
 
 
+@remembered
 def part_shape(fused: FusedCloud) -> PartShape:
-    """The fused cloud as a mesh."""
+    """The fused cloud as a mesh, made once for page and recording."""
     points, normals = _thinned(fused)
     triangles = np.zeros((0, 3), np.int64)
     with suppress(NoResultError), unless_missing():

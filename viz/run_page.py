@@ -28,7 +28,7 @@ from viz.page_parts import (
     with_sections,
 )
 from viz.part_data import part_data
-from viz.part_surface import PartShape, camera_for, part_shape, part_surface
+from viz.part_surface import camera_for, part_shape, part_surface
 from viz.run_numbers import shown_points, view_shifts
 from viz.target_scene import target_scene
 
@@ -187,10 +187,10 @@ def report_html(run: RunData, tolerance: float | None = None, diagnosed: bool = 
         diagnosed: a diagnosis of this model lies in its folder.
     """
     with ThreadPoolExecutor(1) as beside:
-        begun = None if run.registered is None else beside.submit(part_shape, run.fused)
+        if run.registered is not None:
+            beside.submit(part_shape, run.fused)
         history = model_history(run)
-        shape = None if begun is None else begun.result()
-    content = _content(run, history, tolerance, shape)
+    content = _content(run, history, tolerance)
     return render("report.html.j2", head=_head(run, history, tolerance), diagnosed=diagnosed, **content)
 
 
@@ -220,9 +220,7 @@ def _head(run: RunData, history: ModelHistory | None, tolerance: float | None) -
     )
 
 
-def _content(
-    run: RunData, history: ModelHistory | None, tolerance: float | None, shape: PartShape | None
-) -> dict[str, object]:
+def _content(run: RunData, history: ModelHistory | None, tolerance: float | None) -> dict[str, object]:
     um = MICROMETRES[run.session.length_unit]
     return {
         "run": run,
@@ -232,7 +230,7 @@ def _content(
         "tolerance": None if tolerance is None else tolerance * um,
         "tiles": run_tiles(run, history),
         "on_cad": "" if run.session.cad is None else _on_cad(run),
-        "part": shown_part(run, history, shape),
+        "part": shown_part(run, history),
         "surfaces": history is not None,
         "views": view_rows(run, history),
         "hand_eye": hand_eye_rows(run),
@@ -268,18 +266,14 @@ def run_tiles(run: RunData, history: ModelHistory | None) -> list[Tile]:
     return tiles
 
 
-def shown_part(run: RunData, history: ModelHistory | None, shape: PartShape | None = None) -> dict[str, Any] | None:
-    """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither.
-
-    Args:
-        shape: of the part, if it is at hand.
-    """
-    return _targets(run) if history is None else _part(run, history, shape)
+def shown_part(run: RunData, history: ModelHistory | None) -> dict[str, Any] | None:
+    """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither."""
+    return _targets(run) if history is None else _part(run, history)
 
 
-def _part(run: RunData, history: ModelHistory, shape: PartShape | None) -> dict[str, Any]:
+def _part(run: RunData, history: ModelHistory) -> dict[str, Any]:
     """Data of the viewer, and its words."""
-    surface = part_surface(run.fused, history.patches, shape)
+    surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     data = part_data(surface, camera, history, run.session)
     return {
