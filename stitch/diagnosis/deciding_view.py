@@ -517,26 +517,28 @@ def _predict_scans(linear: LinearModel, rival: Score | JointEffect, scans: _Furt
 
 
 def _used_columns(linear: LinearModel, both: Measurement, centre: Array) -> Array:
-    """Return the twists (6 (V + N), a − 6) of all views per unit of the effects in use.
+    """Return left twists (6 (V + N), U) of all views about `centre` per unit of each of U fitted parameters in use.
 
-    Columns of the fit are found again, by value, among those of each effect. Effects that change points have zeros in
-    further views: these have no points.
+    The first six columns of the design, those of the hand-eye, are left out. The design (6V, 6 + U) does not say which
+    parameter a column is of: it is the one whose twists of the V views are these. Effects that move points have zeros
+    in further views, which have no points.
 
     Args:
+        linear: of the V views taken.
         both: measurement of the V views taken and the N further ones.
         centre: (3,) of the surface, reference frame.
     """
-    design = linear.design[:, 6:]
-    out = np.vstack([design, np.zeros((6 * both.views.count - len(design), design.shape[1]))])
+    of_taken = linear.design[:, 6:]
+    of_all = np.vstack([of_taken, np.zeros((6 * both.views.count - len(of_taken), of_taken.shape[1]))])
     for term in linear.model.terms:
         if moves_points([term]):
             continue
-        twists = _twists(both, linear.model, term, centre)
-        for j, column in enumerate(design.T):
-            distance = np.linalg.norm(twists[: len(design)] - column[:, None], axis=0)
-            if len(distance) and distance.min() < 1e-6 * np.linalg.norm(column):
-                out[:, j] = twists[:, distance.argmin()]
-    return out
+        of_term = _twists(both, linear.model, term, centre)
+        for j, column in enumerate(of_taken.T):
+            off = np.linalg.norm(of_term[: len(of_taken)] - column[:, None], axis=0)
+            if len(off) and off.min() < 1e-6 * np.linalg.norm(column):
+                of_all[:, j] = of_term[:, off.argmin()]
+    return of_all
 
 
 def _twists(measurement: Measurement, model: Model, term: Term, centre: Array) -> Array:

@@ -398,32 +398,32 @@ def _independent_covariance(linear: LinearModel) -> Array:
 def _motion(linear: LinearModel, effect: FittedEffect) -> _Motion:
     """Return the motion that is the vertical axis of an effect's plot, by the place where the effect acts.
 
-    Effects of joints: the turn of the joint that moves the views most. Effects of the mount: its twist in the view that
-    moves most, less the mean. All others: the first principal direction of the views' displacements.
+    Effects of joints: the turn of the joint that moves the views most, rad. Effects of the mount: its twist in the view
+    that moves most, less the mean, of such a size that it displaces the views by one length_unit on average. All
+    others: a shift along the first principal direction of the views' displacements, length_unit.
     """
-    term = effect.term
-    response = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
+    term, views = effect.term, linear.measurement.views
+    by_effect = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
     unit = linear.measurement.length_unit
     if term.effect.place == "robot":
-        turned = _joint_columns(linear)
-        views = linear.measurement.views
-        errors = term.effect.function(views.joints, views, **term.arguments) - views.joints
+        per_rad = _joint_columns(linear)
+        joint_errors = term.effect.function(views.joints, views, **term.arguments) - views.joints
         # Square sums of the reduced observations tell how much each joint is seen to move.
-        reduced = linear.reduce(turned * _repeat_for_rows(linear, errors, len(turned)))
+        reduced = linear.reduce(per_rad * _repeat_for_rows(linear, joint_errors, len(per_rad)))
         joint = int(np.argmax(np.sum(reduced**2, axis=0)))
-        per_unit = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
-        return _Motion(f"joint {joint + 1}", "rad", per_unit, errors[:, joint : joint + 1] * per_unit, joint)
+        per_unit = _displacements(linear, per_rad[:, joint : joint + 1])[..., 0]
+        return _Motion(f"joint {joint + 1}", "rad", per_unit, joint_errors[:, joint : joint + 1] * per_unit, joint)
     if term.effect.place == "mount":
-        twists = term.effect.function(linear.measurement.views, **term.arguments)
-        twist = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
-        at_constant = linear.responses([term_of(linear.measurement, _CONSTANT)])[0].columns
-        displacement = _displacements(linear, at_constant @ twist[:, None])[..., 0]
-        # A unit displaces the views by one on average.
-        length = max(float(np.mean(np.linalg.norm(displacement, axis=1))), 1e-300)
-        return _Motion("the scanner's mount", unit, displacement / length, response, twist=twist / length)
-    direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
+        twists = term.effect.function(views, **term.arguments)
+        twist = (twists - twists.mean(axis=0))[np.argmax(np.sum(by_effect**2, axis=1))]
+        # As if the mount were displaced by this twist in all views alike.
+        per_constant_twist = linear.responses([term_of(linear.measurement, _CONSTANT)])[0].columns
+        by_twist = _displacements(linear, per_constant_twist @ twist[:, None])[..., 0]
+        size = max(float(np.mean(np.linalg.norm(by_twist, axis=1))), 1e-300)
+        return _Motion("the scanner's mount", unit, by_twist / size, by_effect, twist=twist / size)
+    direction = np.linalg.svd(by_effect - by_effect.mean(axis=0), full_matrices=False)[2][0]
     of = _BODIES.get(term.effect.place, "the arm")
-    return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
+    return _Motion(of, unit, np.tile(direction, (len(by_effect), 1)), by_effect)
 
 
 def _joint_columns(linear: LinearModel) -> Array:

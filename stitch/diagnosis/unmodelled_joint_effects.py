@@ -129,7 +129,11 @@ class JointEffect:
 
     @cached_property
     def model(self) -> LinearModel:
-        """The model `base` with the effect as the last component of its pose errors, all variances fitted."""
+        """The model `base` with the effect as the last component of its pose errors, all variances fitted.
+
+        With C the covariance (6V, 6V) of the views' twists by an effect of unit size, and R the reduction to n
+        numbers, the component is R C Rᵀ (n, n).
+        """
         base = self.base
         assert base.pose_errors is not None
         component = base.reduce(base.reduce(self.errors.twist_covariance(self.process)).T)
@@ -137,10 +141,11 @@ class JointEffect:
         mixed = with_pose_errors(base.mixed, errors)
         null = self.fit
         if null is None:
-            # The likelihood has several maxima: the fit begins at the likeliest of several starts.
-            nulls = [at.null.variances for at in (base, *base.alternative_starts)]
-            variances_of_effect = [times * SMOOTH_SCALE**2 for times in limits.UNMODELLED_VARIANCES]
-            starts = [np.append(others, of_effect) for others in nulls for of_effect in variances_of_effect]
+            # The likelihood has several maxima: the fit begins at the likeliest of several starts, each of the
+            # variances of all other errors with each of the effect's.
+            of_others = [at.null.variances for at in (base, *base.alternative_starts)]
+            of_effect = [times * SMOOTH_SCALE**2 for times in limits.UNMODELLED_VARIANCES]
+            starts = [np.append(others, variance) for others in of_others for variance in of_effect]
             null = fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))
         return replace(base, mixed=mixed, pose_errors=errors, null=null, full_model=None)
 
