@@ -4,9 +4,9 @@ A dot is the mean over the points of a bin; its line is what the effect explains
 where they move points along these.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,21 +19,39 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
-from stitch.session.measurement import ScanView
+from stitch.session.measurement import ScanView, Views
 
 # Bins of the points of effects of the scanner and of the part's shape.
 _BINS = 16
 # Correspondences at the most that one trend takes.
 _MOST_CORRESPONDENCES = 60_000
+# Effects of points that grow with a covariate of views, or else with time.
 _TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
-# What effects of points live on, with its unit, None for the session's; all others the angle in the field.
-_POINT_AXES = {
-    "range_scale": ("distance from the scanner", None),
-    "range_nonlinearity": ("distance from the scanner", None),
-    "incidence_bias": ("angle of incidence", "°"),
-    "intensity_bias": ("intensity, in standard deviations", ""),
-    "part_sag": ("height above the clamp", None),
+
+
+class _Axis(NamedTuple):
+    """What an effect of points depends on, and its unit; None for the session's."""
+
+    follows: str
+    unit: str | None
+    values: Callable[[Array, ScanView, Array], Array]  # (N,) of points (N, 3) in the scanner's frame, their view, pose
+
+
+_RANGE = _Axis("distance from the scanner", None, lambda points, view, _: np.linalg.norm(view.away(points), axis=1))
+_AXES = {
+    "range_scale": _RANGE,
+    "range_nonlinearity": _RANGE,
+    "incidence_bias": _Axis(
+        "angle of incidence", "°", lambda points, view, _: np.degrees(np.arccos(np.clip(view.cosine, 0, 1)))
+    ),
+    "intensity_bias": _Axis("intensity, in standard deviations", "", lambda _, view, __: np.asarray(view.intensity)),
+    "part_sag": _Axis("height above the clamp", None, lambda points, _, pose: frames.transform(pose, points)[:, 2]),
 }
+_FIELD = _Axis(
+    "angle from the middle of the field",
+    "°",
+    lambda points, view, _: np.degrees(np.arctan(np.sqrt(view.rho2(points)))),
+)
 
 
 def trends_of_points(
@@ -54,18 +72,12 @@ def trends_of_points(
     if surfaces is None or left is None:
         return {}
     term = effects[0].term
-    at, cosine, row, view_of = _points_of_matches(linear, surfaces, term, len(left))
+    axis = _axis_of(term.name, linear.measurement.views)
+    at, cosine, row, view_of = _points_of_matches(linear, surfaces, term, axis, len(left))
     bins = _bins(at, cosine)
     if not bins:
         return {}
-    views = linear.measurement.views
     length = linear.measurement.length_unit
-    temperature = _TEMPERATURES.get(term.name)
-    unit: str | None
-    if temperature is not None:
-        follows, unit = (temperature, "°C") if temperature in views.covariates else ("time", "s")
-    else:
-        follows, unit = _POINT_AXES.get(term.name, ("angle from the middle of the field", "°"))
     places = np.array([at[inside].mean() for inside in bins])
     plots = [predicted_distances(linear, scored) for scored in scores]
     if plots[0] is None:
@@ -79,8 +91,8 @@ def trends_of_points(
         change = effect.change
         wald = float(change.values @ np.linalg.pinv(change.covariance) @ change.values)
         trends[effect.term.name] = EffectTrend(
-            follows=follows,
-            unit=length if unit is None else unit,
+            follows=axis.follows,
+            unit=length if axis.unit is None else axis.unit,
             of=_owner(term),
             value_unit=length,
             at=places,
@@ -95,12 +107,24 @@ def trends_of_points(
     return trends
 
 
+def _axis_of(name: str, views: Views) -> _Axis:
+    """Return what an effect depends on, by name; unknown ones on the angle from the middle of the field."""
+    if (temperature := _TEMPERATURES.get(name)) is None:
+        return _AXES.get(name, _FIELD)
+    known = temperature in views.covariates
+    follows, unit = (temperature, "°C") if known else ("time", "s")
+    at = views.covariates[temperature] if known else views.time
+    return _Axis(follows, unit, lambda points, view, _: np.full(len(points), float(at[view.index])))
+
+
 def _owner(term: Term) -> str:
     """Return what an effect of points belongs to."""
     return "the part" if term.effect.place == "shape" else "the scanner"
 
 
-def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, count: int) -> list[Any]:
+def _points_of_matches(
+    linear: LinearModel, surfaces: SurfaceObservation, term: Term, axis: _Axis, count: int
+) -> list[Any]:
     """Return four arrays (N,) on both points of at most `_MOST_CORRESPONDENCES` correspondences.
 
     1. The value of what the effect depends on.
@@ -124,8 +148,7 @@ def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: 
             points, view = scan_points(linear.measurement, v, index)
             direction = _directions(term, points, view, poses[v])
             cosine = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
-            at = _driver_values(term.name, points, view, poses[v])
-            rows.append((at, sign * cosine, number, np.full(len(some), v)))
+            rows.append((axis.values(points, view, poses[v]), sign * cosine, number, np.full(len(some), v)))
     return [np.concatenate(column) for column in zip(*rows, strict=True)]
 
 
@@ -141,31 +164,6 @@ def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array
     if np.sum(along**2) > 0.9 * np.sum(length**2):
         return rays
     return moved / np.maximum(length, 1e-300)[:, None]
-
-
-def _driver_values(name: str, points: Array, view: ScanView, pose: Array) -> Array:
-    """Return values (N,) of what an effect of points depends on: distance, angle (degrees), height, temperature …
-
-    Args:
-        name: of the effect; unknown ones get the angle from the middle of the field.
-        points: (N, 3), scanner frame.
-        view: what is known of the scan and its points.
-        pose: (4, 4) T_reference_scanner.
-    """
-    match name:
-        case "range_scale" | "range_nonlinearity":
-            return np.linalg.norm(view.away(points), axis=1)
-        case "incidence_bias":
-            return np.degrees(np.arccos(np.clip(view.cosine, 0, 1)))
-        case "intensity_bias":
-            assert view.intensity is not None
-            return view.intensity
-        case "part_sag":
-            return frames.transform(pose, points)[:, 2]
-        case "part_growth" | "scanner_thermal_scale":
-            at = view.views.covariates.get(_TEMPERATURES[name], view.views.time)
-            return np.full(len(points), float(at[view.index]))
-    return np.degrees(np.arctan(np.sqrt(view.rho2(points))))
 
 
 def _bins(at: Array, cosine: Array) -> list[Mask]:
