@@ -124,13 +124,13 @@ def test_every_command_works_on_a_session_of_labelled_points(kind, tmp_path, sti
     stitch_command("compare", out)
     assert json.loads(stitch_command("diagnose", out, "--json"))["effects"]
     stitch_command("next", out)
-    second = json.loads(stitch_command("add", out, "joint_offset", "--json"))
+    second = json.loads(stitch_command("add", out, "joint_offset", "--no-recording", "--json"))
     assert second["heldout_rms"] < first["heldout_rms"]
     # The model of one run judges other poses of the rig without fitting anything.
     other, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
     evaluate = json.loads(
         stitch_command(
-            "run", write_labelled(tmp_path / "o", other, kind), "--hand-eye", out, "-o", tmp_path / "q", "--json"
+            "run", write_labelled(tmp_path / "o", other, kind), "--hand-eye", out, "-o", tmp_path / "q", "--no-recording", "--json"
         )
     )
     assert (
@@ -139,7 +139,7 @@ def test_every_command_works_on_a_session_of_labelled_points(kind, tmp_path, sti
     )
     assert evaluate["targets"][0]["sigma"] == second["targets"][0]["sigma"]
     assert evaluate["residual_rms"] == pytest.approx(second["residual_rms"], rel=0.05)
-    stitch_command("drop", out, "joint_offset")
+    stitch_command("drop", out, "joint_offset", "--no-recording")
     stitch_command("add", out, "--suggested", "--no-recording")
     assert "joint_offset" in json.loads((tmp_path / "r" / "result.json").read_text())["effects"]
     stitch_command("report", out, "--no-diagnosis")

@@ -107,7 +107,7 @@ def turning_only(capture: Capture, T_mount: np.ndarray) -> Capture:
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def test_a_hand_eye_is_found_from_nothing(mount):
-    measured, capture = captured_blade(5, mount=mount, pixels=110)
+    measured, capture = captured_blade(5, views=8, mount=mount, pixels=60)
     found = find_coarse_hand_eye([capture])
     assert found.runner_up_ratio > 1.1
     fine = correct([capture], found.T_mount, found.gate).hand_eye
@@ -201,9 +201,9 @@ def test_what_motions_cannot_show_takes_memory_with_their_number_and_not_with_it
         tracemalloc.stop()
 
 
-def run_of(folder, kind, seed, *, known, hidden=None):
+def run_of(folder, kind, seed, *, known, hidden=None, **size):
     """The run of a cell whose axes are stated a millimetre and a milliradian off, or not at all."""
-    cell = axis_cell(kind, seed, hidden)
+    cell = axis_cell(kind, seed, hidden, **size)
     tables = []
     for axis in cell.axes:
         direction, point = cell.stated(axis)
@@ -227,7 +227,7 @@ def require_true(cell, run):
 
 
 def test_a_turntable_alone_is_placed_and_read_again(tmp_path):
-    cell, run = run_of(tmp_path, "turntable", 31, known=True)
+    cell, run = run_of(tmp_path, "turntable", 31, known=True, views=10, pixels=60)
     require_true(cell, run)
     assert run.session.reference_frame == "table" and "z" in run.unknown
     folder = run.save(tmp_path / "run", recording=False)
