@@ -184,8 +184,9 @@ def test_a_view_that_cannot_follow_is_refused_and_changes_nothing(arrays, change
     assert len(live.session.views) == len(live.said) == 1
 
 
-def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
+def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd, monkeypatch):
     """Rows come before their scans, and half a row before the rest, as a slow disk shows them."""
+    monkeypatch.setattr("stitch.cli.run._EVERY", 0.1)
     folder = tmp_path / "s"
     folder.mkdir()
     (folder / "clouds").mkdir()
@@ -195,9 +196,9 @@ def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
     def fill():
         table = head
         for i, row in enumerate(rows):
-            time.sleep(0.4)
+            time.sleep(0.15)
             (folder / "views.csv").write_text(table + row[: len(row) // 2])
-            time.sleep(0.4)
+            time.sleep(0.15)
             table += row
             (folder / "views.csv").write_text(table)
             cloud = sorted((cell_folder / "clouds").iterdir())[i]
