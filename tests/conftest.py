@@ -41,16 +41,28 @@ settings.load_profile("any_machine")
 gc.disable()
 
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
-LONGEST = (
-    "test_stitch.py",
-    "test_diagnosis.py",
-    "test_run_page.py",
-    "test_view_screening.py",
-    "test_run.py",
-    "test_stock.py",
-    "test_ros2_node.py",
-    "test_conventions.py",
-)
+LONGEST = [
+    "test_stitch",
+    "test_api",
+    "test_pipeline",
+    "test_view_screening",
+    "test_diagnosis",
+    "test_robot",
+    "test_run",
+    "test_live",
+    "test_conventions",
+    "test_stock",
+    "test_first_session",
+    "test_run_page",
+    "test_drive",
+    "test_deciding_view",
+    "test_first_run",
+    "test_session",
+    "test_window",
+    "test_coarse",
+    "test_scanner_places",
+    "test_carried_scans",
+]
 
 
 def pytest_collection_finish():
@@ -60,7 +72,7 @@ def pytest_collection_finish():
 
 def pytest_collection_modifyitems(items):
     place = {name: i for i, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")

@@ -130,7 +130,14 @@ def test_every_command_works_on_a_session_of_labelled_points(kind, tmp_path, sti
     other, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), probe=kind == "frames")
     evaluate = json.loads(
         stitch_command(
-            "run", write_labelled(tmp_path / "o", other, kind), "--hand-eye", out, "-o", tmp_path / "q", "--no-recording", "--json"
+            "run",
+            write_labelled(tmp_path / "o", other, kind),
+            "--hand-eye",
+            out,
+            "-o",
+            tmp_path / "q",
+            "--no-recording",
+            "--json",
         )
     )
     assert (
