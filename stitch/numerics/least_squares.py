@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr
 from scipy.linalg.lapack import dlauum, dpotrf, dpotrs, dtrtri
+from scipy.sparse import csr_array
 from scipy.special import ndtri
 
 from stitch.numerics.frames import Array, Indices, Mask
@@ -265,6 +266,14 @@ def summed_squares(blocks: Array) -> Array:
     """
     wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
     return wide @ wide.T
+
+
+def less_group_means(rows: Array, group: Indices, weight: Array | None = None) -> Array:
+    """Return rows (N, …) less the mean of the rows of the same group (N,), weighted by (N,); None: by 1."""
+    flat = rows.reshape(len(rows), -1)
+    of_group = csr_array((np.ones(len(rows)) if weight is None else weight, (group, np.arange(len(rows)))))
+    means = (of_group @ flat) / np.maximum(of_group.sum(axis=1), 1e-300)[:, None]
+    return (flat - means[group]).reshape(rows.shape)
 
 
 def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:

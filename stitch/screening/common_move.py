@@ -16,6 +16,7 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
+from stitch.numerics.least_squares import less_group_means
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
 from stitch.session.capture import Capture, Sightings
 
@@ -109,7 +110,7 @@ class CommonMove:
         self.target = s.target[self.view, self.slot]
         base = np.where((np.arange(len(s.points)) >= self.start)[:, None, None], self.T, np.eye(4))
         self.in_base, self.placed = (x[self.view, self.slot] for x in _placed(capture, T_mount, base, s))
-        self.rest = self._centred(self.placed[:, :, None])[:, :, 0]
+        self.rest = less_group_means(self.placed, self.target)
 
     @property
     def total(self) -> float:
@@ -179,7 +180,7 @@ class CommonMove:
         of_mount = to_reference @ to_base @ self.T_mount[:3, :3]
         rows = [of_mount @ -frames.skew((p - centroid) / size), of_mount]
         rows += [moved * (to_reference @ -frames.skew((self.in_base - base_centroid) / size)), moved * to_reference]
-        columns = self._centred(np.concatenate(rows, axis=2)).reshape(-1, 12)
+        columns = less_group_means(np.concatenate(rows, axis=2), self.target).reshape(-1, 12)
         x = np.linalg.lstsq(columns, -self.rest.ravel(), rcond=1e-8)[0]
         # Rotations were counted in displacements at a distance of `size`.
         unit = np.repeat([1 / size, 1.0], 3)
@@ -187,13 +188,6 @@ class CommonMove:
         T_mount = self.T_mount @ about @ frames.exp(unit * x[:6]) @ frames.inverse(about)
         T = about_base @ frames.exp(unit * x[6:]) @ frames.inverse(about_base) @ self.T
         return CommonMove(self.capture, T_mount, T, self.start)
-
-    def _centred(self, rows: Array) -> Array:
-        """Return rows (N, 3, c) of the points, each less the mean over the points of its target."""
-        sums = np.zeros((len(self.sightings.targets), *rows.shape[1:]))
-        np.add.at(sums, self.target, rows)
-        count = np.maximum(np.bincount(self.target, minlength=len(sums)), 1)
-        return rows - (sums / count[:, None, None])[self.target]
 
     def _view_means(self) -> Array:
         """Return the mean residual (V, 3) of each view, reference frame; zero for a view without points."""

@@ -12,6 +12,7 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Indices
+from stitch.numerics.least_squares import less_group_means
 from stitch.numerics.units import METRES, length_text
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye, sensor_motions
 from stitch.observations.targets.outliers import drop_mislabelled, find_mislabelled
@@ -22,7 +23,6 @@ from stitch.screening.motions import RelativeScans
 from stitch.screening.moved_targets import find_moved_targets
 from stitch.screening.problems import SessionProblem, likeliest_text
 from stitch.session.capture import Capture, Sightings, build_capture, sightings_of
-from stitch.session.measurement import variance_within
 from stitch.session.session import SessionData
 
 # Arms that are off by this much, and by this share of how far the targets move, are bad and may be right; a better
@@ -127,7 +127,8 @@ def _motion_seen(capture: Capture) -> float:
     """
     s = capture.sightings
     assert s is not None
-    return float(np.sqrt(3 * variance_within(s.points[s.used], s.target[s.used])))
+    off = less_group_means(s.points[s.used], s.target[s.used])
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:

@@ -16,6 +16,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
+from stitch.numerics.least_squares import less_group_means
 from stitch.session.axes import Axes
 from stitch.session.axis_poses import axes_of
 from stitch.session.capture import Capture
@@ -482,16 +483,10 @@ def sensor_kind(session: SessionData) -> SensorKind | None:
     in_base = [sighting.points for _, sighting in sighted]
     on_flange = [frames.transform(frames.inverse(T), sighting.points) for T, sighting in sighted]
     target = np.unique(np.concatenate([sighting.targets for _, sighting in sighted]), return_inverse=True)[1]
-    spread = variance_within(np.concatenate(in_base), target)
-    strays = variance_within(np.concatenate(on_flange), target)
+    # Mean squares about the mean of each target.
+    spread = np.mean(less_group_means(np.concatenate(in_base), target) ** 2)
+    strays = np.mean(less_group_means(np.concatenate(on_flange), target) ** 2)
     return "tracker" if strays < _SAME_FRAME**2 * spread else None
-
-
-def variance_within(points: Array, group: Indices) -> float:
-    """Return the variance of points (N, 3) about the mean of their group (N,), the average of x, y and z."""
-    count = np.maximum(np.bincount(group), 1)[:, None]
-    mean = np.stack([np.bincount(group, x) for x in points.T], axis=1) / count
-    return float(np.mean((points - mean[group]) ** 2))
 
 
 def all_ahead(point_sets: Sequence[Array]) -> bool:

@@ -11,13 +11,13 @@ A measured probe adds the turns: A·X = Z·B (Shah 2013).
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.hand_eye import AXXB_SOLVERS, minimise_on_sphere, shah
+from stitch.numerics.least_squares import less_group_means
 from stitch.session.capture import Capture, Sightings
 
 # Reweighted solutions on the way to a start, and steps from it at the most; one that turns or shifts by less than this
@@ -97,8 +97,7 @@ class _PointEquations:
     def __init__(self, capture: Capture, s: Sightings) -> None:
         """Take the N labelled points in use, centred and scaled, so that the equations are well conditioned.
 
-        `left` is T_reference_mount (N, 4, 4), `p` the point (N, 3) in the sensor's frame, `target` its number (N,), and
-        `of_target` (targets, N) sums over the points of a target.
+        `left` is T_reference_mount (N, 4, 4), `p` the point (N, 3) in the sensor's frame, `target` its number (N,).
         """
         v, slot = np.nonzero(s.used)
         self.left = capture.T_reference_mount[v]
@@ -107,7 +106,6 @@ class _PointEquations:
         self.scale = float(np.linalg.norm(off, axis=1).mean()) or 1.0
         self.p = off / self.scale
         self.target: Indices = s.target[v, slot]
-        self.of_target = csr_matrix((np.ones(len(self.target)), (self.target, np.arange(len(self.target)))))
 
     def linear_starts(self) -> list[Array]:
         """Return one or two rotations (3, 3), the nearest to solutions R of linear least squares in vec R and t (3,).
@@ -135,7 +133,8 @@ class _PointEquations:
         columns = np.concatenate([np.einsum("nij,nk->nijk", L, self.p).reshape(-1, 3, 9), L], axis=2)
         weight = np.ones(len(L))
         for _ in range(_REWEIGHTED):
-            C, b = self._centred(columns, weight), self._centred(self.left[:, :3, 3:] / self.scale, weight)
+            C = less_group_means(columns, self.target, weight)
+            b = less_group_means(self.left[:, :3, 3:] / self.scale, self.target, weight)
             root = np.sqrt(weight)[:, None, None]
             A, right = (root * C).reshape(-1, 12), -(root * b).ravel()
             # t is projected out, vec R solved, and t found from it.
@@ -169,8 +168,8 @@ class _PointEquations:
         for step in range(_STEPS):
             turned = self.p @ R.T
             placed = L @ (turned + t)[..., None] + self.left[:, :3, 3:] / self.scale
-            columns = self._centred(np.concatenate([-L @ frames.skew(turned), L], axis=2), weight)
-            residual = self._centred(placed, weight)
+            columns = less_group_means(np.concatenate([-L @ frames.skew(turned), L], axis=2), self.target, weight)
+            residual = less_group_means(placed, self.target, weight)
             free = slice(3 if step == 0 else 0, 6)
             root = np.sqrt(weight)[:, None, None]
             x = np.zeros(6)
@@ -183,12 +182,6 @@ class _PointEquations:
             if step and np.abs(x).max() < _STEP_ENDS:
                 break
         return frames.make(R, self.scale * t - R @ self.offset), float(distances.sum())
-
-    def _centred(self, rows: Array, weight: Array) -> Array:
-        """Return rows (N, 3, c) less the weighted mean of the rows of the same target: its place is eliminated."""
-        flat = rows.reshape(len(rows), -1)
-        means = (self.of_target @ (weight[:, None] * flat)) / np.maximum(self.of_target @ weight, 1e-300)[:, None]
-        return (flat - means[self.target]).reshape(rows.shape)
 
 
 def _weights(distances: Array) -> Array:
