@@ -96,7 +96,7 @@ class Term(Value):
         parameters = [p if p.value == value else replace(p, value=float(value)) for p, value in pairs]
         if sigmas is not None:
             parameters = [replace(p, sigma=float(sigma)) for p, sigma in zip(parameters, sigmas, strict=True)]
-        return replace(self, parameters=tuple(parameters))
+        return Term(self.effect, tuple(parameters))
 
 
 @dataclass(frozen=True)
@@ -239,8 +239,8 @@ def geometry_terms(measurement: Measurement) -> tuple[Term, ...]:
 
 def term_of(measurement: Measurement, effect: Effect) -> Term:
     """Return an effect as a term at value 0; parameters that are tried value by value in the middle of their grid."""
-    parameters = parameters_in(measurement, effect)
-    return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in parameters))
+    zero = Term(effect, parameters_in(measurement, effect))
+    return zero.at(np.array([p.grid[len(p.grid) // 2] if p.grid else 0.0 for p in zero.parameters]))
 
 
 def grid_terms(measurement: Measurement, effect: Effect) -> list[Term]:
