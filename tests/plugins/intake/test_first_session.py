@@ -138,7 +138,7 @@ def test_raw_scans_of_reghec_become_the_sessions_that_they_are(reghec, tmp_path,
 def campaign(tmp_path_factory):
     """Six views of a blade by an arm without errors, with its joints."""
     folder = tmp_path_factory.mktemp("campaign") / "s"
-    write_session(folder, measured_blade(11, 6, "eye_in_hand", (0.0, 0.0), pixels=60), "s")
+    write_session(folder, measured_blade(11, 6, "eye_in_hand", (0.0, 0.0), pixels=40), "s")
     session = load_session(folder)
     T = np.array([view.T_base_flange for view in session.views])
     joints = np.array([view.joints for view in session.views])
