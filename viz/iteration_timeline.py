@@ -297,7 +297,9 @@ def _number(length: float, unit: str) -> str:
 
 def _log_rms(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment]) -> None:
     """The rms of each kind of moment, and that of every view, as series."""
-    by_stage = {stage: [(i, m.rms) for i, m in enumerate(moments) if m.stage == stage] for stage in _stages(moments)}
+    by_stage = dict[str, list[tuple[int, float]]]()
+    for i, moment in enumerate(moments):
+        by_stage.setdefault(moment.stage, []).append((i, moment.rms))
     of_views = {"view": list(enumerate(run.view_rms.tolist()))}
     for timeline, every in (("iteration", by_stage), ("view", of_views)):
         for name, series in every.items():
@@ -308,7 +310,3 @@ def _log_rms(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment]) -
                 path, at = f"rms/{name}", rr.TimeColumn(timeline, sequence=known[:, 0].astype(np.int64))
                 rec.log(path, rr.SeriesPoints(marker_sizes=4.0, names=name), static=True)
                 rec.send_columns(path, [at], rr.Scalars.columns(scalars=values))
-
-
-def _stages(moments: Sequence[Moment]) -> list[str]:
-    return list(dict.fromkeys(moment.stage for moment in moments))

@@ -242,7 +242,7 @@ def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
     Runs of several sessions share a model.toml; a line says that the others in that folder still have the old model.
     """
     from stitch.cli.run import show_report
-    from stitch.output.json_file import others_of_rig, to_json
+    from stitch.output.json_file import runs_of_rig, to_json
     from stitch.output.result_document import result_document
 
     if as_json:
@@ -251,12 +251,12 @@ def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
     show_report(result)
     for line in remarks(result) if in_full() else ():
         say(line)
-    if others := others_of_rig(run):
+    folder = run.resolve()
+    if others := [name for name in runs_of_rig(folder.parent) if name != folder.name]:
         effects = f" --effects {','.join(result.effects)}" if result.effects else ""
         say(
             f"Of its rig this run alone has changed: {', '.join(others)} and their common model.toml are as they were. "
-            f"For one model of all: stitch run, with all sessions{effects} and -o "
-            f"{shlex.quote(str(run.resolve().parent))}"
+            f"For one model of all: stitch run, with all sessions{effects} and -o {shlex.quote(str(folder.parent))}"
         )
 
 

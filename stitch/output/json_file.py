@@ -100,12 +100,6 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
         )
 
 
-def others_of_rig(run: Path) -> list[str]:
-    """Return names of the runs that one rig's folder holds beside a run."""
-    folder = run.resolve()
-    return [name for name in runs_of_rig(folder.parent) if name != folder.name]
-
-
 def runs_of_rig(path: Path) -> list[str]:
     """Return names of the runs in the folder of a rig, which has no result of its own."""
     return [] if (path / "result.json").exists() else _inner_runs(path)
