@@ -1,10 +1,9 @@
 """Fixtures: the measured data beside the project, small synthetic cells, the command line."""
 
 import gc
-import io
 import os
 import shutil
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +13,12 @@ from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
 from data_synth.write import write_session
-from stitch.cli.main import main
 from stitch.cli.report import printing_browser
 from stitch.diagnosis import candidates
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.system.threads import library_threads_off
+from tests.command_line import ended
 from tests.in_browser import DRAWN
 
 # Two test processes that each use all cores would fight for them.
@@ -94,15 +93,7 @@ def reghec(shared_data):
 @pytest.fixture(scope="session")
 def stitch_command():
     """The command line, which ends with exit code 0: its arguments to what it prints on stdout."""
-
-    def call(*arguments: object) -> str:
-        out = io.StringIO()
-        with redirect_stdout(out), pytest.raises(SystemExit) as stop:
-            main([str(a) for a in arguments])
-        assert not stop.value.code
-        return out.getvalue()
-
-    return call
+    return lambda *words: ended(*words).out
 
 
 @pytest.fixture(scope="session")

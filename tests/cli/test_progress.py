@@ -128,13 +128,12 @@ def run_folder(_blade_on_disk, tmp_path_factory, stitch_command):
     return folder / "r"
 
 
-def test_a_note_stays_in_the_ledger_when_the_model_changes(run_folder, stitch_command, monkeypatch, capsys):
+def test_a_note_stays_in_the_ledger_when_the_model_changes(run_folder, stitch_command, monkeypatch):
     stitch_command("note", run_folder, "clamp was loose", "--by", "Q")
     stitch_command("note", run_folder, "  measured again ", "--step", "0")
     monkeypatch.setenv("STITCH_PROGRESS", "json")
-    capsys.readouterr()
-    stitch_command("add", run_folder, "range_scale", "--no-recording")
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith('{"progress"')]
+    said = ended("add", run_folder, "range_scale", "--no-recording").err
+    lines = [json.loads(line) for line in said.splitlines() if line.startswith('{"progress"')]
     steps = json.loads((run_folder / "ledger.json").read_text())
     told = [(note["by"], note["text"]) for note in steps[0]["notes"]]
     assert told == [("Q", "clamp was loose"), ("", "measured again")]

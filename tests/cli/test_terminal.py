@@ -2,14 +2,12 @@
 
 import csv
 import html
-import io
 import json
 import os
 import re
 import subprocess
 import sys
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +22,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.cli.terminal import emit, stdout_for_results
 from stitch.system.lines import broken_lines
+from tests.command_line import ended
 from viz.figures import png
 
 PRINTS = """
@@ -92,23 +91,23 @@ QUANTITY = re.compile(
 
 
 @pytest.fixture(scope="module")
-def printed(tmp_path_factory, stitch_command, library_of):
+def printed(tmp_path_factory, library_of):
     """Lines that commands print of a session of labelled points, and where they are wrongly asked."""
     folder = tmp_path_factory.mktemp("lines")
     session, *_ = labelled_cell(2, views=24, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]))
     measured, run = write_labelled(folder / "s", session, "points"), folder / "r"
-    out = io.StringIO()
-    with redirect_stderr(out), redirect_stdout(out), pytest.MonkeyPatch.context() as patch, library_of():
+    right = (
+        ("check", measured),
+        ("run", measured, "-o", run, "--no-recording"),
+        ("compare", run),
+        ("diagnose", run),
+        ("add", run, "joint_offset", "--no-recording"),
+    )
+    wrong = (("run", measured, "--effects", "elbow"), ("drop", run, "backlash"))
+    with pytest.MonkeyPatch.context() as patch, library_of():
         patch.setattr(Figure, "savefig", _without_pictures)
-        out.write(stitch_command("check", measured))
-        out.write(stitch_command("run", measured, "-o", run, "--no-recording"))
-        for command in ("compare", "diagnose"):
-            out.write(stitch_command(command, run))
-        out.write(stitch_command("add", run, "joint_offset", "--no-recording"))
-        for wrong in (["run", str(measured), "--effects", "elbow"], ["drop", str(run), "backlash"]):
-            with pytest.raises(SystemExit):
-                main(wrong)
-    return out.getvalue().splitlines()
+        said = [ended(*words) for words in right] + [ended(*words, code=2) for words in wrong]
+    return "".join(told.err + told.out for told in said).splitlines()
 
 
 def _without_pictures(_, file, **options):

@@ -2,13 +2,11 @@
 
 import csv
 import hashlib
-import io
 import json
 import re
 import subprocess
 import sys
 import tomllib
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +25,6 @@ import viz.cells.window_fit
 import viz.cells.window_seam
 from data_synth.cells.drilling import DrillingCell, Sizes
 from data_synth.cells.drilling_job import write_job
-from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.plugins.cells import job_files
 from stitch.session.reading.session_folder import load_session
@@ -67,7 +64,7 @@ class Offer:
 def handed_out(tmp_path_factory):
     """Every command once, with recording, page and session; Rerun strict. The fit: its map and its document too."""
     folder = tmp_path_factory.mktemp("cells")
-    further, told = {"fit": ("-o", folder / "map", "--json")}, io.StringIO()
+    further, printed = {"fit": ("-o", folder / "map", "--json")}, {}
     part = {"stitch.cell_recordings": "record", "stitch.cell_reports": "write_page"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(job_files, "entry_points", lambda group, name: [Offer(getattr(VIEWERS[name], part[group]))])
@@ -75,19 +72,12 @@ def handed_out(tmp_path_factory):
         try:
             for command, job in JOBS.items():
                 files = ("--recording", folder / f"{command}.rrd", "--report", folder / f"{command}.html")
-                with redirect_stdout(told if command == "fit" else io.StringIO()):
-                    run(command, job, *files, "--session", folder / command, *further.get(command, ()))
+                own = further.get(command, ())
+                printed[command] = ended(command, job, *files, "--session", folder / command, *own).out
         finally:
             rr.set_strict_mode(False)
-    (folder / "fit.json").write_text(told.getvalue())
+    (folder / "fit.json").write_text(printed["fit"])
     return folder
-
-
-def run(*arguments):
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as stop:
-        assert not stop.code
 
 
 def rows(file):
@@ -153,7 +143,7 @@ def test_drilling_session_keeps_the_distances_of_the_holes(tmp_path):
     exact = Sizes(stretch=0.0, wave=0.0, repeat=0.0, pixel=0.0, tool_tilt=0.0)
     cell = DrillingCell(4, exact)
     write_job(tmp_path / "job", cell)
-    run("drill", tmp_path / "job" / "job.toml", "--session", tmp_path / "s")
+    ended("drill", tmp_path / "job" / "job.toml", "--session", tmp_path / "s")
     names, places = placed_points(tmp_path / "s")
     true = np.array([cell.actual[name][0] for name in names])
     # The height of a hole over the flange is read with 0.03 mm, its place by the camera to about 0.01.
@@ -248,7 +238,7 @@ def test_expected_shape_is_what_the_commanded_clamps_do():
     assert result.shape_largest.max() > 3.0
 
 
-def test_a_fit_is_where_the_part_stands_and_serves_the_seam(handed_out, tmp_path, capsys):
+def test_a_fit_is_where_the_part_stands_and_serves_the_seam(handed_out, tmp_path):
     part = json.loads((handed_out / "fit.json").read_text())["parts"][0]
     place = [3567.7, -2954.3, 1932.9]  # of the example's pane, mm
     assert np.abs(np.array(part["T_base_part"])[:3, 3] - place).max() < 1.0
@@ -260,8 +250,7 @@ def test_a_fit_is_where_the_part_stands_and_serves_the_seam(handed_out, tmp_path
     (tmp_path / "fit.json").write_bytes((handed_out / "map" / "fit.json").read_bytes())
     text = JOBS["seam"].read_text()
     (tmp_path / "seam.toml").write_text(text.split("[part]")[0] + 'fit = "fit.json"\n')
-    run("seam", tmp_path / "seam.toml", "--json", "-o", tmp_path / "out.csv")
-    seams = json.loads(capsys.readouterr().out)
+    seams = json.loads(ended("seam", tmp_path / "seam.toml", "--json", "-o", tmp_path / "out.csv").out)
     assert len(seams) == 8
     assert {row["verdict"] for row in seams} == {"good"}
 
