@@ -580,24 +580,15 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         InputError: an effect that is not known, or that the session cannot have.
         NoResultError: no two views overlap.
     """
-    from stitch.diagnosis.score import start_with_effects
-
     recorder = recorder or SilentRecorder()
     session, measurement = state.session, state.measurement
     with library_threads_off():
         clock = Clock()
         effects = list(dict.fromkeys(effects))
         recorder.start(session)
-        require_effects([measurement], effects)
-        # The fit begins at the parameters of the run's model, a new effect at zero or at its best event.
-        new = [name for name in effects if name not in state.model.effects]
-        model = start_with_effects(session, new, None, measurement, state.model, state.gate)
-        model = model.with_terms([term for term in model.terms if term.is_geometry or term.name in effects])
-        gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
-        hand_eye = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
+        start = _start_of_change(state, effects)
+        (hand_eye,) = start.hand_eyes
         coarse = _show_coarse_stage(session, measurement, hand_eye, clock.lap(), recorder)
-        # No search and no screening: where the fit begins and which views belong is known from the first run.
-        start = FitStart([hand_eye], model=model, gate=state.gate)
         register = state.register_method or DEFAULT
         with closing(_Conductor([session], start, [coarse], [recorder], register)) as conductor:
             fitted = conductor.fit([session], [measurement])
@@ -609,6 +600,42 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}
         return replace(run, tried=tried)
+
+
+def error_with(state: RunData, effects: Sequence[str]) -> float:
+    """Return the rms on views left out, length_unit, that `change` to these effects would have; unknown: in the fit.
+
+    Only the fit is made, for effects that are compared and not kept.
+
+    Raises:
+        InputError, NoResultError: as of `change`.
+    """
+    session = state.session
+    with library_threads_off():
+        start = _start_of_change(state, effects)
+        fitted = pipeline_for(session).fit([session], [state.measurement], start, SilentRecorder())
+        return fitted.heldout_or_fit_rms(0)
+
+
+def _start_of_change(state: RunData, effects: Sequence[str]) -> FitStart:
+    """Return where the fit of a run with `effects` as all its effects begins.
+
+    No search and no screening: the hand-eye to begin with and which views belong are known from the first run. The fit
+    begins at the parameters of the run's model, a new effect at zero or at its best event.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+    """
+    from stitch.diagnosis.score import start_with_effects
+
+    session, measurement = state.session, state.measurement
+    require_effects([measurement], effects)
+    new = [name for name in effects if name not in state.model.effects]
+    model = start_with_effects(session, new, None, measurement, state.model, state.gate)
+    model = model.with_terms([term for term in model.terms if term.is_geometry or term.name in effects])
+    gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
+    hand_eye = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
+    return FitStart([hand_eye], model=model, gate=state.gate)
 
 
 def diagnose(run: RunData) -> Diagnosis:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from stitch.api.pipeline import change, diagnose
+from stitch.api.pipeline import change, diagnose, error_with
 from stitch.effects.contract import find_effect, require_available
 from stitch.errors import InputError
 from stitch.recorder import Recorder
@@ -264,22 +264,19 @@ def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> t
         fewer = {t.name: [name for name in result.effects if name != t.name] for t in added}
         faint = next((term.name for term in added if term.sigmas_from_zero < FAINT_SIGMAS), None)
         if faint is not None:
-            idle, without = faint, change(result, fewer[faint])
+            idle = faint
             reason = f"{idle} ends with no parameter that differs from zero"
         else:
-            fits = {name: change(result, others) for name, others in fewer.items()}
-            if not fits:
+            errors = {name: error_with(result, others) for name, others in fewer.items()}
+            if not errors:
                 return result, lines
-            idle = min(fits, key=lambda name: fits[name].heldout_or_fit_rms)
-            without = fits[idle]
-            ratio = without.heldout_or_fit_rms / result.heldout_or_fit_rms
+            idle = min(errors, key=errors.__getitem__)
+            ratio = errors[idle] / result.heldout_or_fit_rms
             if ratio * (HELDOUT_RISE if result.session.has_clouds else 1.0) >= 1.0:
                 return result, lines
             reason = f"without {idle} views left out are predicted better in the end"
         lines.append(f"{reason}; it was dropped.")
-        # Fitted once more, now shown.
-        if recorder is not None:
-            without = change(result, fewer[idle], recorder)
+        without = change(result, fewer[idle], recorder)
         result = replace(without, tried=result.tried | {idle: reason})
 
 

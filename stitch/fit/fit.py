@@ -93,6 +93,17 @@ class FittedRig:
         assert targets is not None
         return targets.heldout_rms
 
+    def heldout_or_fit_rms(self, index: int) -> float:
+        """Return the rms of session `index` on views left out, length_unit; that of the fit where it is unknown."""
+        heldout = self.heldout_rms(index)
+        if np.isfinite(heldout):
+            return heldout
+        if self.correction is not None:
+            return self.correction.overlaps[index].gram.rms
+        targets = self.sessions[index].targets
+        assert targets is not None
+        return targets.rms
+
 
 class Linearised(Protocol):
     """What was observed, linearised about a model."""

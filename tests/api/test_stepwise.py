@@ -183,6 +183,7 @@ def test_an_effect_that_ends_with_nothing_is_taken_out():
     added = replace(added, model=added.model.with_terms([replace(added.terms[0], parameters=faint)]))
     fewer, lines = stepwise._drop_idle(added, set(), None)
     assert not fewer.effects and "gear_harmonic" in fewer.tried and "differs from zero; it was dropped" in lines[0]
+    assert stepwise.error_with(added, []) == fewer.heldout_or_fit_rms
     assert stepwise._drop_idle(added, {"gear_harmonic"}, None) == (added, [])
 
 
@@ -202,6 +203,9 @@ def test_an_effect_without_which_views_left_out_are_predicted_better_is_taken_ou
         )
 
     monkeypatch.setattr(stepwise, "change", lambda run, names, *_: state(tuple(names), run.session.has_clouds))
+    monkeypatch.setattr(
+        stepwise, "error_with", lambda run, names: state(tuple(names), run.session.has_clouds).heldout_or_fit_rms
+    )
     monkeypatch.setattr(stepwise, "replace", lambda run, tried: SimpleNamespace(**vars(run) | {"tried": tried}))
     fewer, lines = stepwise._drop_idle(state(("a", "b")), set(), None)
     assert fewer.effects == ("a",) and "without b views left out are predicted better" in lines[0]
