@@ -82,7 +82,8 @@ def fit_surfaces(
     def linearise(before: "SurfaceStep | None") -> LinearisedSurfaces:
         """Return the problem about the first model, or about the one after a step."""
         about = model if before is None else before.model
-        captures, unconstrained = _free_views(measurements, about, gates)
+        earlier = None if before is None else before.linearised.unconstrained
+        captures, unconstrained = _free_views(measurements, about, gates, earlier)
         columns = [view_columns(m, about, f) for m, f in zip(measurements, unconstrained, strict=True)]
         return LinearisedSurfaces(measurements, about, captures, unconstrained, columns)
 
@@ -101,7 +102,8 @@ def fit_surfaces(
     model = with_fitted_effects(
         step.model, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
     )
-    captures, unconstrained = _free_views(measurements, model, [f.overlaps.gate for f in linearised.unconstrained])
+    last_gates = [f.overlaps.gate for f in linearised.unconstrained]
+    captures, unconstrained = _free_views(measurements, model, last_gates, linearised.unconstrained)
     overlaps = tuple(_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True))
     return Correction(
         geometry=model,
@@ -232,16 +234,22 @@ SurfaceStep = Step[LinearisedSurfaces, HandEyeFit]
 
 
 def _free_views(
-    measurements: Sequence[Measurement], model: Model, gates: Sequence[float]
+    measurements: Sequence[Measurement],
+    model: Model,
+    gates: Sequence[float],
+    earlier: Sequence[UnconstrainedPoses] | None,
 ) -> tuple[tuple[Capture, ...], list[UnconstrainedPoses]]:
     """Return per session the capture with the effects of a model taken out, and its views moved by the overlaps alone.
 
     Args:
         gates: per session the largest distance between corresponding points at first, length_unit.
+        earlier: the views moved under a model near by, whose search goes on; None: all is searched.
     """
     captures = tuple(corrected_capture(measurement, model) for measurement in measurements)
+    before = [None] * len(captures) if earlier is None else [f.overlaps for f in earlier]
     unconstrained = [
-        unconstrained_poses(c, c.poses(model.T_mount), gate) for c, gate in zip(captures, gates, strict=True)
+        unconstrained_poses(c, c.poses(model.T_mount), gate, overlaps)
+        for c, gate, overlaps in zip(captures, gates, before, strict=True)
     ]
     return captures, unconstrained
 
