@@ -23,12 +23,12 @@ from stitch.model.model import (
 )
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.parameter_selection import WhitenedData, omitted_rms
-from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
+from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns
 from stitch.observations.surfaces.hand_eye_fit import (
     SCANNER_SCALE,
     FittedEffects,
-    HandEyeFit,
+    HandEyeSolution,
     hand_eye_statistics,
     solve_hand_eye,
     whiten_captures,
@@ -67,8 +67,7 @@ def fit_surfaces(
 ) -> Correction:
     """Return the fit of hand-eye and effects that all sessions of a rig share, with covariance and overlaps.
 
-    The steps of `iterate` find the values. The last one is then solved again with the prior of pose errors: the values
-    hardly change, their covariance does.
+    The steps of `iterate` find the values; their covariance, with the prior of pose errors, is that of the last one.
 
     Args:
         model: effects in use with the values to begin with.
@@ -93,14 +92,15 @@ def fit_surfaces(
         gate = step.linearised.unconstrained[0].overlaps.gate
         recorder.iteration("fit", len(history), poses, step.rms, gate)
         history.append(step.rms)
-    # Once more from the same place, with all that the arm may do wrong in its covariance.
+    # The covariance of the last step, with all that the arm may do wrong.
     linearised, choice = step.linearised, step.choice
     centres = [f.overlaps.gram.centre for f in linearised.unconstrained]
-    step = linearised.solve(choice, prior_pose_errors(measurements, linearised.model, centres))
-    hand_eye = step.solution
+    errors = prior_pose_errors(measurements, linearised.model, centres)
+    hand_eye = hand_eye_statistics(step.solution, errors, linearised.common_errors(choice))
+    fitted_model = replace(step.model, covariance=hand_eye.covariance)
     kept = kept_root(step.model.terms, model.effects_covariance)
     model = with_fitted_effects(
-        step.model, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
+        fitted_model, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
     )
     last_gates = [f.overlaps.gate for f in linearised.unconstrained]
     captures, unconstrained = _free_views(measurements, model, last_gates, linearised.unconstrained)
@@ -151,12 +151,13 @@ class LinearisedSurfaces:
         omitted = omitted_rms(self._whitened(fitted), sizes_of(self.model.terms), fitted, self._effect_of_parameter)
         return Choice(fitted, np.where(held | self._is_gauge, 0.0, omitted), scanner_errors)
 
-    def solve(self, choice: Choice, errors: PoseErrors | None = None) -> "SurfaceStep":
+    def solve(self, choice: Choice) -> "SurfaceStep":
         """Return the step of hand-eye and chosen parameters by generalised least squares; those not chosen become zero.
+
+        It counts as moved by sigmas of white scatter; no covariance is computed.
 
         Args:
             choice: as `choose` returned it.
-            errors: pose errors beside white scatter that the covariance counts; None: there are none.
         """
         fitted = choice.fitted
         terms = self.model.terms
@@ -164,23 +165,18 @@ class LinearisedSurfaces:
         effects = FittedEffects(
             tuple(c[:, fitted] for c in self.columns), before[fitted], WEAK * sizes_of(terms)[fitted]
         )
-        common = self._common_errors(choice)
+        common = self.common_errors(choice)
         solution = solve_hand_eye(self.captures, self.unconstrained, self.model.T_mount, effects, common)
-        hand_eye = hand_eye_statistics(solution, errors, common)
         values = before.copy()
         # Held parameters, as the time of an event, are not fitted and keep their values.
         values[~self._held] = 0.0
-        values[fitted] = hand_eye.values
-        model = replace(
-            self.model,
-            T_mount=hand_eye.T_mount,
-            terms=with_parameter_values(terms, values),
-            covariance=hand_eye.covariance,
-        )
-        moved = float(np.max(np.abs(values - before)[fitted] / hand_eye.values_sigma, initial=0.0))
-        return Step(self, choice, hand_eye, model, moved, _model_rms(self.unconstrained))
+        values[fitted] = solution.values + solution.x[6:]
+        model = replace(self.model, T_mount=solution.T_mount, terms=with_parameter_values(terms, values))
+        sigma = np.sqrt(np.maximum(np.diag(solution.covariance)[6:], 1e-300))
+        moved = float(np.max(np.abs(values - before)[fitted] / sigma, initial=0.0))
+        return Step(self, choice, solution, model, moved, _model_rms(self.unconstrained))
 
-    def _common_errors(self, choice: Choice) -> dict[str, list[Array]]:
+    def common_errors(self, choice: Choice) -> dict[str, list[Array]]:
         """Return by source, per session, left twists (6V, K) of the views for one sigma of errors that all views share.
 
         Sources are the scanner, each effect whose parameters are left at zero though they may not be, and the
@@ -230,7 +226,7 @@ class LinearisedSurfaces:
         return whiten_captures(sessions, self.model.T_mount, values_of(self.model.terms), free)
 
 
-SurfaceStep = Step[LinearisedSurfaces, HandEyeFit]
+SurfaceStep = Step[LinearisedSurfaces, HandEyeSolution]
 
 
 def _free_views(

@@ -233,11 +233,6 @@ class HandEyeFit:
     # (6, 6 + P) of ξ with itself and the parameters, without the prior's part in directions that no motion shows.
     visible_covariance: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
-    @property
-    def values_sigma(self) -> Array:
-        """(P,) standard deviations of the effects' values."""
-        return np.sqrt(np.maximum(np.diag(self.values_covariance), 1e-300))
-
 
 def hand_eye_statistics(
     solution: HandEyeSolution,
