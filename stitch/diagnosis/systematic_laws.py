@@ -469,7 +469,8 @@ class Span:
         """Return whether the other's columns are combinations of these, up to 0.1 % of their sum of squares."""
         if not self.square or not other.square:
             return False
-        return float(np.sum((self.basis.T @ other.columns) ** 2)) > _SAME * other.square
+        within = self.basis.T @ other.columns
+        return float(np.vdot(within, within)) > _SAME * other.square
 
     @cached_property
     def square(self) -> float:

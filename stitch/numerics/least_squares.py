@@ -77,8 +77,8 @@ def _invert_single(V: Array) -> InverseCovariance:
     lower, _ = dlauum(half, lower=1)
     # Above the diagonal all are zero.
     inverse = lower + lower.T
-    np.fill_diagonal(inverse, np.diag(lower))
-    return InverseCovariance(inverse[None], half[None], 2 * float(np.log(np.diag(L)).sum()))
+    np.fill_diagonal(inverse, lower.diagonal())
+    return InverseCovariance(inverse[None], half[None], 2 * float(np.log(L.diagonal()).sum()))
 
 
 def _invert_blocks(V: Array) -> InverseCovariance:
@@ -194,7 +194,7 @@ def solve_in_units(matrix: Array, vector: Array, unit: Array) -> Array:
     """
     scaled = matrix * np.outer(unit, unit)
     root, failed = dpotrf(scaled, lower=1, clean=0)
-    if not failed and np.diag(root).min() > _SOLVABLE:
+    if not failed and root.diagonal().min() > _SOLVABLE:
         return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
     return _pseudo_inverse(scaled, unit) @ vector
 

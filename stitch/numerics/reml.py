@@ -439,9 +439,9 @@ def _root_of_inverse(M: Array) -> tuple[Array, float]:
     """
     scaled, unit = equilibrated(M)
     L, failed = dpotrf(scaled, lower=1, clean=1)
-    if not failed and len(L) and np.diag(L).min() > CLEARLY_KNOWN:
+    if not failed and len(L) and L.diagonal().min() > CLEARLY_KNOWN:
         root = np.asarray(dtrtri(L, lower=1)[0].T)
-        logdet = 2 * float(np.log(np.diag(L)).sum())
+        logdet = 2 * float(np.log(L.diagonal()).sum())
     else:
         values, vectors = np.linalg.eigh(scaled)
         keep = values > _KNOWN
@@ -610,7 +610,7 @@ def _scoring_step(curvature: Array, slope: Array, prior_slope: Array, prior_curv
     # prior's the larger of both counts, so that the step goes downhill.
     with_prior = curvature + np.diag(np.maximum(prior_curvature - prior_slope, prior_curvature))
     relative_change = -np.linalg.solve(with_prior, slope)
-    if (relative_change > np.where(np.diag(with_prior) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
+    if (relative_change > np.where(with_prior.diagonal() > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
         return np.maximum(np.log1p(relative_change), -_LEAP)
     likelihood_slope = np.maximum(slope - prior_slope, 0)
     step = -np.linalg.solve(curvature + np.diag(prior_curvature + likelihood_slope), slope).astype(float)
