@@ -203,7 +203,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
     # Before small steps are dropped: the warnings tell of them.
-    warnings = snooping_warnings(session, snooping)
+    doubts = _whole_session_warnings(session, capture, snooping)
     if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
         # A slip of the part, or a knock of the mount, that effects can describe is left to the diagnosis: no view
         # beyond it is left out.
@@ -219,13 +219,20 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
             weak=tuple((names[v], names[w]) for v, w in snooping.linkage.only_links),
         ),
-        doubts=(
-            *target_warnings(session, capture.sightings),
-            *(problem.fix for problem in stock_problems(session, capture)),
-            *_copies(session, capture, snooping),
-            *warnings,
-        ),
+        doubts=doubts,
     )
+
+
+def _whole_session_warnings(session: SessionData, capture: Capture, snooping: Snooping) -> tuple[str, ...]:
+    """Return the warnings of a session as a whole: its targets, stock, copied scans, and what the tests of views say.
+
+    Args:
+        capture: of the session, without the effects in use.
+        snooping: what the tests say.
+    """
+    of_stock = (problem.fix for problem in stock_problems(session, capture))
+    of_copies = _copies(session, capture, snooping)
+    return *target_warnings(session, capture.sightings), *of_stock, *of_copies, *snooping_warnings(session, snooping)
 
 
 def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:
@@ -285,13 +292,10 @@ def session_warnings(
     Args:
         correction: of surfaces; None where there are none.
     """
-    of_targets = target_warnings(session, measurement.capture.sightings)
     if correction is None:
-        return of_targets
+        return target_warnings(session, measurement.capture.sightings)
     snooping = _snoop_session(session, measurement, correction, index)
-    capture = correction.captures[index]
-    warnings = snooping_warnings(session, snooping)
-    return (*of_targets, *(problem.fix for problem in stock_problems(session, capture)), *warnings)
+    return _whole_session_warnings(session, correction.captures[index], snooping)
 
 
 def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:

@@ -1,6 +1,7 @@
 """Runs of sessions with blunders: named and left out, or refused; never fused in silence."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stitch.fit.fit import FittedRig, FittedSession
 from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.output.result_document import result_document
+from stitch.screening import view_screening
 from stitch.screening.view_screening import ViewScreening, fit_screened_views
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
@@ -159,3 +161,14 @@ def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
     fitted = FittedRig([FittedSession(measurement, None, ())])
     found = fit_screened_views([session], [measurement], lambda sessions, measurements: fitted)
     assert found.screenings == [ViewScreening()] and found.sessions == [session]
+
+
+def test_copied_scans_are_warned_of_after_a_change_of_the_model_too(monkeypatch):
+    monkeypatch.setattr(view_screening, "_snoop_session", lambda *_: SimpleNamespace(left_out=()))
+    monkeypatch.setattr(view_screening, "snooping_warnings", lambda *_: ())
+    monkeypatch.setattr(view_screening, "stock_problems", lambda *_: [])
+    scans = [SimpleNamespace(points=np.full((3, 3), value)) for value in (1.0, 2.0, 1.0)]
+    correction = SimpleNamespace(captures=[SimpleNamespace(scans=scans, sightings=None)])
+    session = SimpleNamespace(names=["v001", "v002", "v003"])
+    (warning,) = view_screening.session_warnings(session, SimpleNamespace(), correction, 0)
+    assert warning.startswith("The scans of v001 and v003 are the same points")
