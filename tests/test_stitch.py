@@ -160,12 +160,12 @@ def test_a_run_from_arrays_loads_no_plug_in_but_the_search_of_a_convention():
     code = """
 import numpy, stitch
 from data_synth.fixtures.blade_cells import measured_blade
-cell = measured_blade(0, views=4, pixels=30)
+cell = measured_blade(0, views=4, mount="eye_in_hand", pixels=30)
 clouds, poses = [cloud.points for cloud in cell.clouds], numpy.array(cell.T_base_flange)
-stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_to_hand", check=False))
+stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=False))
 early = [name for name in sys.modules if name.startswith("stitch.plugins")]
 assert not early, early
-stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_to_hand", check=True))
+stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=True))
 """
     searching = {name for name in loaded(code) if name.startswith("stitch.plugins.")}
     assert searching and all(name.startswith("stitch.plugins.intake") for name in searching)
