@@ -109,15 +109,6 @@ def effect_twists(measurement: Measurement, model: Model, centre: Array, effects
     return [d.reshape(len(d), -1).T * term.typical for term, d in zip(terms, derivatives, strict=True)]
 
 
-def _rig_twists(
-    measurements: Sequence[Measurement], model: Model, centres: Sequence[Array], effects: Sequence[Effect]
-) -> list[Array]:
-    """Return `effect_twists` (6V, P) of all views of a rig, session after session, each about its centre (3,)."""
-    sessions = zip(measurements, centres, strict=True)
-    by_session = [effect_twists(m, model, centre, effects) for m, centre in sessions]
-    return [np.concatenate(columns) for columns in zip(*by_session, strict=True)]
-
-
 def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
     """Return left twists (6V, n) of the views about `centre` (3,) for a plausible offset of each joint.
 
@@ -396,7 +387,9 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
         joints = np.concatenate([m.views.joints for m in measurements])
         of_arm = arm_effects(measurements)
         constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
-        twists = _rig_twists(measurements, model, centres, [*of_arm, *constant])
+        sessions = zip(measurements, centres, strict=True)
+        by_session = [effect_twists(m, model, centre, [*of_arm, *constant]) for m, centre in sessions]
+        twists = [np.concatenate(columns) for columns in zip(*by_session, strict=True)]
         for effect, columns in zip(of_arm, twists, strict=False):
             effects[effect.name] = (EFFECT_FAMILY.get(effect.name, effect.name), columns)
         # Effects of one family share a size.
