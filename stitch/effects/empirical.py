@@ -70,7 +70,9 @@ def _bias(name: str, order: int, shape: Array) -> Effect:
 
     def along_ray(points: Array, view: ScanView, direction: Array) -> Array:
         """Return how far (1, N) a bias of 1 moves points (N, 3) of a view along a direction, scanner frame."""
-        return shape[view.index] * np.sum(view.along(points) * direction, axis=1)[None]
+        away = view.away(points)
+        along = np.einsum("ij,ij->i", away, np.broadcast_to(direction, away.shape))
+        return shape[view.index] * (along / np.sqrt(np.einsum("ij,ij->i", away, away)))[None]
 
     formula = f"along the ray by k·P{order}({name})"
     return _effect(name, f"bias_{order}_of_{name}", formula, along_ray, k=number("mm", 0.1, 5.0))

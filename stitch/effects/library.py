@@ -207,9 +207,10 @@ def range_scale(points: Array, view: ScanView, s: float) -> Array:
 @effect("sensor", needs=("optics",), k=number("mm", typical=5.0, limit=100.0), s=offset("mm", 0.5, 10.0, axes=("",)))
 def range_nonlinearity(points: Array, view: ScanView, k: float, s: Array) -> Array:
     """x = x* + u·(k·d² + s·d), d = r/r₀−1, r₀ the standoff: right at d = −s/2k, which need not be the standoff"""
-    u = view.along(points)
-    d = (view.away(points) * u).sum(axis=1) / view.views.standoff - 1
-    return points + u * (k * d**2 + s * d)[:, None]
+    away = view.away(points)
+    r = np.sqrt(np.einsum("ij,ij->i", away, away))
+    d = r / view.views.standoff - 1
+    return points + away * ((k * d**2 + s * d) / r)[:, None]
 
 
 @effect("sensor", needs=("surfaces",), b=number("mm", typical=0.1, limit=1.0))
