@@ -582,6 +582,7 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
     """
     recorder = recorder or SilentRecorder()
     session, measurement = state.session, state.measurement
+    index = 0  # of the session in its rig, which has no other
     with library_threads_off():
         clock = Clock()
         effects = list(dict.fromkeys(effects))
@@ -592,10 +593,10 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         register = state.register_method or DEFAULT
         with closing(_Conductor([session], start, [coarse], [recorder], register)) as conductor:
             fitted = conductor.fit([session], [measurement])
-            warnings = session_warnings(session, fitted.sessions[0].measurement, fitted.correction, 0)
+            warnings = session_warnings(session, fitted.sessions[index].measurement, fitted.correction, index)
             (finished,) = conductor.finish()
         screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
-        run = _assemble_run(session, 0, fitted, hand_eye, finished, screening, alone=state.alone)
+        run = _assemble_run(session, index, fitted, hand_eye, finished, screening, alone=state.alone)
         run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
         recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}
@@ -614,7 +615,7 @@ def error_with(state: RunData, effects: Sequence[str]) -> float:
     with library_threads_off():
         start = _start_of_change(state, effects)
         fitted = pipeline_for(session).fit([session], [state.measurement], start, SilentRecorder())
-        return fitted.heldout_or_fit_rms(0)
+        return fitted.heldout_or_fit_rms(index=0)
 
 
 def _start_of_change(state: RunData, effects: Sequence[str]) -> FitStart:

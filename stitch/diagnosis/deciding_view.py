@@ -577,36 +577,56 @@ def _condition_on_views(
 def _predict_targets(
     linear: LinearModel, observation: ReducedRows, scores: Sequence[Score], joints: Array, wait: Array
 ) -> list[Prediction]:
-    """Return the rivals' predictions of further views that see all targets, whose errors are independent.
+    """Return the rivals' predictions of N further views that see all targets.
 
-    The residuals of a view are reduced to the numbers that a motion of the view, or a rival, can change.
+    The m residuals of a view are reduced to the d numbers that a motion of the view, or a rival, can change. Their
+    errors are independent of those of all other views.
+
+    Args:
+        observation: the targets of the V views taken, reduced.
+        scores: of the rivals.
+        joints: (N, n) of the further views, rad.
+        wait: (N,) s before each of them, beside the usual pause.
     """
     targets = observation.rows
     assert isinstance(targets, TargetRows)
     measurement = candidate_measurement(linear.measurement, joints, wait)
-    rows, columns = candidate_rows(measurement, targets, targets.places, [zero_term(scored) for scored in scores])
-    by_point = [moved for scored, moved in zip(scores, columns, strict=True) if moves_points([scored.form.term])]
+    # by_rival: per rival (N, m, P), change of the further views' rows per unit of its parameters.
+    rows, by_rival = candidate_rows(measurement, targets, targets.places, [zero_term(scored) for scored in scores])
+    of_points = [moved for scored, moved in zip(scores, by_rival, strict=True) if moves_points([scored.form.term])]
+    changes = np.concatenate([rows.lever, *of_points], axis=2)
     per_sigma = np.where(rows.noise > 0, rows.noise, np.inf) ** -0.5
-    reduction = (
-        pose_numbers(per_sigma[..., None] * np.concatenate([rows.lever, *by_point], axis=2)) * per_sigma[:, None]
-    )
+    # (N, d, m). What can change is found in rows divided by their sigmas; the last factor divides those to be reduced.
+    reduction = pose_numbers(per_sigma[..., None] * changes) * per_sigma[:, None]
     landmarks = rows.landmarks @ observation.reduction.kept
-    # Effects in use stay as they are: their columns are zero.
-    in_use = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - landmarks.shape[2]))
-    scattered = [reduction @ moved for moved in rows.scattered]
+    # Effects in use stay as they are in the further views.
+    zeros_of_effects = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - landmarks.shape[2]))
+    by_model = np.concatenate([rows.hand_eye, landmarks, zeros_of_effects], axis=2)
+    by_flange = [reduction @ moved for moved in rows.scattered]
     predictions = []
-    for scored, moved in zip(scores, columns, strict=True):
+    for scored, moved in zip(scores, by_rival, strict=True):
         base = model_beside(linear, scored)
-        reduced = reduction @ np.concatenate([rows.hand_eye, landmarks, in_use, moved[..., scored.form.keep]], axis=2)
-        N, d, q = reduced.shape
+        # (N, d, q): change of the numbers per unit of the model's coefficients, then of the rival's.
+        columns = reduction @ np.concatenate([by_model, moved[..., scored.form.keep]], axis=2)
+        N, d, q = columns.shape
+        # Zero: no view shares errors with another one.
         with_taken = np.zeros((N * d, len(base.white_z)))
-        errors = base.null.variances[NOISE] * np.broadcast_to(np.eye(d), (N, d, d)).copy()
-        for variance, of_flange in zip(base.flange_scatter(base.null), scattered, strict=True):
-            errors += variance * (of_flange @ of_flange.transpose(0, 2, 1))
-        mean, covariance = _condition_on_views(base, scored, reduced.reshape(-1, q), with_taken, block_diag(*errors))
-        design = reduced[..., : base.white_design.shape[1]]
+        errors = block_diag(*_errors_of_views(base, by_flange))
+        mean, covariance = _condition_on_views(base, scored, columns.reshape(-1, q), with_taken, errors)
+        design = columns[..., : base.white_design.shape[1]]
         predictions.append(Prediction(mean.reshape(N, d), covariance.reshape(N, d, N, d), design))
     return predictions
+
+
+def _errors_of_views(base: LinearModel, by_flange: Sequence[Array]) -> Array:
+    """Return the covariance (N, d, d) of each view's numbers by the sensor's noise and by scatter of the flange.
+
+    Args:
+        by_flange: two (N, d, 3), change of the numbers per rotation and per translation of the flange.
+    """
+    noise = base.null.variances[NOISE] * np.eye(by_flange[0].shape[1])
+    of_scatter = zip(base.flange_scatter(base.null), by_flange, strict=True)
+    return sum((variance * (moved @ moved.transpose(0, 2, 1)) for variance, moved in of_scatter), start=noise)
 
 
 def model_beside(linear: LinearModel, scored: Score) -> LinearModel:

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from stitch.diagnosis.candidate_views import candidate_measurement
-from stitch.diagnosis.candidates import candidate_as_fitted
+from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.deciding_view import model_beside, predict_views
 from stitch.diagnosis.dependence import Dependence
 from stitch.diagnosis.fitted_effect import Change, EffectTrend, FittedEffect, fit_change, fit_effect
@@ -148,30 +148,41 @@ def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     """Return the trend of an effect that is in the model: dots as if it were not, its line, and the dots with it.
 
-    For that the effect is taken out of the model again: its share is added to the observations, and its columns leave
-    the design. None for an effect that changes points, or of which nothing was fitted.
+    None for an effect that changes points, of which nothing was fitted, or whose motion moves no view.
     """
-    if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
+    is_fitted = ~term.gridded & (term.values != 0)  # gridded ones, as the time of an event, are held
+    if moves_points([term]) or not is_fitted.any():
         return None
+    # Poses scatter independently here, as in the trends of candidates.
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
-
-    # All columns of the effect, also of parameters that the fit holds at zero: they are found in the design by value.
-    of_effect = fitted.responses([term])[0].columns
-    others = [
-        j
-        for j, column in enumerate(fitted.design.T)
-        if np.linalg.norm(of_effect - column[:, None], axis=0).min() > 1e-6 * np.linalg.norm(column)
-    ]
-    # Observations are residuals from the model, which has the effect: its share is added back.
-    observed = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
-    without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=observed))
-    effect = FittedEffect(term, form, fit_change(without, form.columns, without))
+    without = _without_effect(fitted, term, form)
+    effect = FittedEffect(term, form, fit_change(without, form.columns, beside=without))
     axes = _axes(without, _clearest_joint(effect))
+    # The dots with the effect are what is left of observations without its share, beside its free columns.
     with_effect = _Plot(replace(fitted, design=np.hstack([without.design, form.response])), linear, *axes)
     if not with_effect.moves_views:
         return None
     return _trend_in_plot(_Plot(without, linear, *axes, after=with_effect.measured), effect)
+
+
+def _without_effect(fitted: LinearModel, term: Term, form: Form) -> LinearModel:
+    """Return a linear model from which an effect in it is taken out, at the variances that were fitted with it.
+
+    Its share is added to the reduced observations, which are residuals from a model with it, and its columns leave the
+    design.
+
+    Args:
+        form: of the effect as it was fitted.
+    """
+    # Of all its parameters, also of those that the fit holds at zero. The design does not say whose a column is: those
+    # of the effect are equal to these, but for rounding.
+    of_effect = fitted.responses([term])[0].columns
+    off = np.linalg.norm(fitted.design[:, :, None] - of_effect[:, None], axis=0).min(axis=1)
+    others = off > 1e-6 * np.linalg.norm(fitted.design, axis=0)
+    share = (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
+    mixed = replace(fitted.mixed, z=fitted.mixed.z + share)
+    return replace(fitted, design=fitted.design[:, others], mixed=mixed)
 
 
 def _clearest_joint(effect: FittedEffect) -> FittedEffect:
@@ -241,7 +252,7 @@ def _trend_of_joint(
     per_unit = _displacements(fitted, turned)[..., 0]
     motion = _Motion(f"joint {number}", "rad", per_unit, error[:, None] * per_unit, number - 1)
     plot = _Plot(fitted, scatter, motion, axis)
-    change = fit_change(fitted, fitted.reduce(response), fitted)
+    change = fit_change(fitted, fitted.reduce(response), beside=fitted)
     return plot.trend(change, motion.of, shapes @ change.values) if plot.moves_views else None
 
 

@@ -319,12 +319,15 @@ class ScatterLimit:
 
 
 def scatter_limit(session: SessionData) -> ScatterLimit:
-    """Return the repeatability that the session states under [robot]; else the scatter that no sound arm exceeds."""
+    """Return the repeatability that the session states under [robot]; else the scatter that no sound arm exceeds.
+
+    Rotations are in rad, translations in length_unit.
+    """
     stated, (rotation, translation) = session.repeatability, limits.IMPLAUSIBLE
-    usual = translation / MILLIMETRES[session.length_unit]
+    implausible = translation / MILLIMETRES[session.length_unit]
     return ScatterLimit(
         rotation=rotation if stated.sigma_rotation is None else stated.sigma_rotation,
-        translation=usual if stated.sigma_translation is None else stated.sigma_translation,
+        translation=implausible if stated.sigma_translation is None else stated.sigma_translation,
         rotation_stated=stated.sigma_rotation is not None,
         translation_stated=stated.sigma_translation is not None,
     )

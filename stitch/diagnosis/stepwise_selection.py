@@ -194,7 +194,8 @@ def _worst_at_ends(
 ) -> tuple[str, Extrapolation] | None:
     """Return the name of the chosen effect that errs most at ends of joint ranges, and its test; None if all may stay.
 
-    An effect may stay that helps there, alone or beside the likeliest further effect (`_helps_beside_next`).
+    The error is the mean square distance with the effect over that without it. An effect may stay that helps there,
+    alone or beside the likeliest further effect (`_helps_beside_next`).
 
     Args:
         candidates: further effects.

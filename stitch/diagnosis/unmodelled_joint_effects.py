@@ -120,11 +120,14 @@ class JointEffect:
         if self.follows not in (WITH_TIME, TIME_ONLY):
             # The base has no joint angle that it could follow.
             return joint
+        # At the views themselves, so that both of its covariances are those between views.
         kernel = self.errors.kernel_of(self.process)
-        error = _posterior_error(self, kernel, kernel)[0] / self.typical_size
-        motions = self.errors.columns[:, self.process].reshape(len(error), 6)
-        turned = self.model.reduce((motions * error[:, None]).reshape(-1, 1))[:, 0]
-        or_base = could_be_base(self.model, turned, error[:, None])
+        error, _ = _posterior_error(self, with_views=kernel, prior=kernel)
+        # (V, 1) in typical sizes of the joint's error: the columns are twists of the views per such a size.
+        sizes = error[:, None] / self.typical_size
+        twists = self.errors.columns[:, self.process].reshape(-1, 6) * sizes
+        effect = self.model.reduce(twists.reshape(-1, 1))[:, 0]
+        or_base = could_be_base(self.model, effect, shapes=sizes)
         return f"{joint}, or the base about the same axis (these views cannot tell)" if or_base else joint
 
     @cached_property
@@ -293,7 +296,8 @@ def joint_curves(effects: Sequence[JointEffect]) -> tuple[JointCurve, ...]:
     curves = list[JointCurve]()
     for effect in effects:
         kernel = effect.errors.kernel_of(effect.process)
-        variance = float(_posterior_error(effect, kernel, kernel)[0].var())
+        error, _ = _posterior_error(effect, with_views=kernel, prior=kernel)
+        variance = float(error.var())
         curves += [_curve_along(effect, covariate, variance) for covariate in _covariates(effect)]
     return tuple(sorted((c for c in curves if c.share > limits.CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
@@ -367,7 +371,8 @@ def _curve_along(effect: JointEffect, covariate: _Covariate, variance: float) ->
     with_places = remaining.mean() * kernel(places, places)
     # Takes off the mean over the views, the last of the places.
     centred = np.eye(len(places)) - np.repeat([0.0, 1.0 / views], [_CURVE_POINTS, views])
-    mean, covariance = _posterior_error(effect, centred @ with_views, centred @ with_places @ centred.T)
+    prior = centred @ with_places @ centred.T
+    mean, covariance = _posterior_error(effect, with_views=centred @ with_views, prior=prior)
     return JointCurve(
         joint=effect.joint,
         covariate=name,

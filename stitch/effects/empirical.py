@@ -46,7 +46,11 @@ def _effect(
     needs: tuple[str, ...] = (),
     **specs: Spec,
 ) -> Effect:
-    """Return an effect of the sensor whose parameters act in proportion (`Effect.per_unit`)."""
+    """Return an effect of the sensor whose P parameters act in proportion.
+
+    Args:
+        per_unit: how far (P, N) a unit of each moves points (N, 3) of a view along an axis (3,) (`Effect.per_unit`).
+    """
 
     def distort(points: Array, view: ScanView, **values: float) -> Array:
         """Return points (N, 3) of a view, scanner frame, moved by all parameters."""

@@ -79,11 +79,14 @@ def fit_surfaces(
     """
 
     def linearise(before: "SurfaceStep | None") -> LinearisedSurfaces:
-        """Return the problem about the first model, or about the one after a step."""
+        """Return the least-squares problem linearised about the first model, or about the one after the step before.
+
+        The observations are the poses to which overlaps alone move the views; the columns, what effects do to them.
+        """
         about = model if before is None else before.model
-        earlier = None if before is None else before.linearised.unconstrained
-        captures, unconstrained = _free_views(measurements, about, gates, earlier)
-        columns = [view_columns(m, about, f) for m, f in zip(measurements, unconstrained, strict=True)]
+        pairs_from = None if before is None else before.linearised.unconstrained
+        captures, unconstrained = _moved_by_overlaps(measurements, about, gates, pairs_from)
+        columns = [view_columns(m, about, free) for m, free in zip(measurements, unconstrained, strict=True)]
         return LinearisedSurfaces(measurements, about, captures, unconstrained, columns)
 
     history: list[float] = []
@@ -103,7 +106,7 @@ def fit_surfaces(
         fitted_model, choice.fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
     )
     last_gates = [f.overlaps.gate for f in linearised.unconstrained]
-    captures, unconstrained = _free_views(measurements, model, last_gates, linearised.unconstrained)
+    captures, unconstrained = _moved_by_overlaps(measurements, model, last_gates, linearised.unconstrained)
     overlaps = tuple(_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True))
     return Correction(
         geometry=model,
@@ -229,23 +232,24 @@ class LinearisedSurfaces:
 SurfaceStep = Step[LinearisedSurfaces, HandEyeSolution]
 
 
-def _free_views(
+def _moved_by_overlaps(
     measurements: Sequence[Measurement],
     model: Model,
     gates: Sequence[float],
-    earlier: Sequence[UnconstrainedPoses] | None,
+    pairs_from: Sequence[UnconstrainedPoses] | None,
 ) -> tuple[tuple[Capture, ...], list[UnconstrainedPoses]]:
     """Return per session the capture with the effects of a model taken out, and its views moved by the overlaps alone.
 
     Args:
         gates: per session the largest distance between corresponding points at first, length_unit.
-        earlier: the views moved under a model near by, whose search goes on; None: all is searched.
+        pairs_from: the views moved from a model near by, whose pairs of views that overlap are used again; None: they
+            are searched.
     """
     captures = tuple(corrected_capture(measurement, model) for measurement in measurements)
-    before = [None] * len(captures) if earlier is None else [f.overlaps for f in earlier]
+    overlaps_before = [None] * len(captures) if pairs_from is None else [free.overlaps for free in pairs_from]
     unconstrained = [
-        unconstrained_poses(c, c.poses(model.T_mount), gate, overlaps)
-        for c, gate, overlaps in zip(captures, gates, before, strict=True)
+        unconstrained_poses(c, c.poses(model.T_mount), gate, before)
+        for c, gate, before in zip(captures, gates, overlaps_before, strict=True)
     ]
     return captures, unconstrained
 

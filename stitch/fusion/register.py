@@ -300,7 +300,7 @@ class _Progress:
         return falls
 
     def note(self, iterations: int) -> str:
-        """Return one sentence on why register ended and where."""
+        """Return one sentence on why register ended without convergence, and which poses are kept."""
         kept = iterations - self.stalled
         if self.stalled >= _PATIENCE:
             return (

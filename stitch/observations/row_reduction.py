@@ -27,7 +27,7 @@ class RowReduction:
     per_sigma: Array  # (B, m) 1/sigma of each row, by the sensor's noise or a known variance; 0 of absent rows
     of_views: Array  # (V, d, m) orthonormal rows: d numbers of each view that say all of its pose
     beyond: Array  # (e, V·m) orthonormal rows: numbers that landmarks or effects of points change, no pose
-    known: Mask  # (B, m) rows whose variance is known: each a number by itself
+    known: Mask  # (B, m) rows whose variance is known, as of nominal places: each a number by itself
     noise_only: tuple[int, float]  # count of further numbers that are noise alone, and their sum of squares
     points: csr_array  # (B·m, U) change of the rows, times `per_sigma`, per unknown of the landmarks
     kept: Array  # (U, r) combinations of these unknowns that poses or known rows depend on: the others are eliminated
@@ -40,10 +40,18 @@ class RowReduction:
         return views - (-(len(self.beyond) + int(self.known.sum())) // size)
 
     def reduce(self, rows: Array) -> Array:
-        """Return the reduced numbers (C, d, P) of P columns of rows (B, m, P).
+        """Return the reduced numbers (C, d, P) of P columns of rows (B, m, P), each row in its own unit.
 
-        Every row is divided by its sigma. First come d numbers a view, then those that mix views (`beyond`), then one
-        per row of known variance; zeros fill the last block.
+        There are m rows in each of B blocks: first those of the V views, then those of no view, as nominal places of
+        targets. Every row is divided by its sigma. The numbers are, in turn,
+
+        1. d of each view, which say all of its pose;
+        2. e that mix views: landmarks and effects of points change them, no pose does (`beyond`);
+        3. one of each row of known variance, of whatever block.
+
+        They fill C = V + ⌈(e + rows of known variance)/d⌉ blocks, the last one with zeros. What is left of the rows
+        places landmarks on which nothing else depends, or is noise alone, of which `noise_only` is all that a
+        likelihood needs.
         """
         views = len(self.of_views)
         white = self.per_sigma[..., None] * rows

@@ -256,13 +256,14 @@ def place_unlinked_views(
     They are placed on the surface of the core, the largest group of linked views. Other groups are placed first, each
     as a whole, then single views, round by round: those placed join the core, and the others are tried again. On a part
     that looks alike from several sides a view may fit several places: it is not placed unless one of them is the pose
-    of its own row in the table.
+    of its own row in the table. Nor is a view of a group that fits nowhere as a whole, unless it fits at the pose of
+    some row: its own, or, where scans were mixed up, another's.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
         unconstrained: the views moved by the overlaps alone.
         tolerance: distance along the normal at which a point lies on the surface, length_unit.
-        needed: closure from which a scan counts as placed.
+        needed: share (0 to 1) of a scan's points near the surface that have to lie on it, its closure.
     """
     if not linked.unlinked or len(linked.core) < 2:
         return {}, list(linked.unlinked), set()
@@ -274,7 +275,7 @@ def place_unlinked_views(
     core = [*linked.core, *placed]
     singles, several = _place_singles(capture, model_poses, poses, core, alone, tolerance, needed)
     # The views of a group share their displacement. If the group fits nowhere, a single view that fits somewhere, and
-    # not at a row's pose, does so only because the part looks alike there.
+    # not at any row's pose, does so only because the part looks alike there.
     in_groups = {v for group in linked.components[1:] if len(group) > 1 for v in group}
     near = CLOSE_SHARE * part_size([capture])
     unsure = {

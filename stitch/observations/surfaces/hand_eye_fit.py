@@ -122,11 +122,13 @@ class CaptureEvidence:
         return replace(kept, capture=self.capture.without(views), gram=gram)
 
     def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
-        """Return Σ w e² per correction of the robot's poses, over the pairs that `views` are in.
+        """Return (K,) Σ w e² per correction of the robot's poses, over the pairs that `views` are in.
+
+        e are the distances that the correction leaves between corresponding points, length_unit.
 
         Args:
             views: their numbers.
-            corrections: each (6 + P,): twist of the hand-eye, then changes of the effects' parameters.
+            corrections: K, each (6 + P,): twist of the hand-eye, then changes of the effects' parameters.
         """
         touched = np.isin(self.gram.pairs, views).any(axis=1)
         J = np.column_stack([hand_eye_jacobian(self.capture, self.T_mount, self.gram.centre), self.effect_twists])

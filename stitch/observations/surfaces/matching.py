@@ -64,6 +64,7 @@ def overlapping_pairs(
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
+        gate: distance within which points meet, length_unit.
         at_most: points of a view that are probed; more than 250 tell nothing new.
     """
     queries = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])

@@ -508,7 +508,8 @@ def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]
     """Return the variance between views (B,) and its degrees of freedom (B,), pooled over two groups of views.
 
     The groups are the views in the bin, by their mean there, and those outside, by their mean over all rows. Each is
-    taken about its own mean: a bin of one or two views alone would not know the variance.
+    taken about its own mean: a bin of one or two views alone would not know the variance. It is NaN without degrees of
+    freedom, or without a view in the bin.
 
     Args:
         values: (B, V) means of the views in the bins.

@@ -68,11 +68,11 @@ def check_scale(session: SessionData, cloud_unit: str) -> None:
 
 
 def require_near(where: str, points: Array) -> None:
-    """Refuse points farther from the scanner than any sensor measures: one would stretch every grid over the cloud.
+    """Refuse points farther along an axis than any sensor measures: one would stretch every grid over the cloud.
 
     Args:
         where: file or scan, for the message.
-        points: (N, 3) m, scanner frame.
+        points: (N, 3) m, scanner frame; at least one.
 
     Raises:
         InputError: how many, and the number of the first, from 1.

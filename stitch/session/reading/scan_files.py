@@ -124,42 +124,69 @@ def _names_without_header(comments: list[str], count: int, separator: str | None
     return [*"xyz", *(f"scalar_{i}" for i in range(count - 3))][:count]
 
 
-# Sections of surfaces in a CSV of Gocator: attributes in two lines, then names above the rows.
+# Sections of surfaces in a CSV of Gocator; each begins with so many lines: its name, names of attributes, their values.
 _SURFACES, _POINTS = ("Part", "Surface"), "SurfacePointCloud"
+_SECTION_HEAD = 3
 
 
 def _columns_of_gocator(path: Path, lines: list[str]) -> dict[str, Array]:
-    """Return x, y, z (N,) of the first surface in a CSV of Gocator, empty pixels left out.
+    """Return x, y, z (N,), mm, scanner frame, of the first surface in a CSV of Gocator, empty pixels left out.
 
-    A point cloud has x, y, z of each pixel side by side.
+    The section of a surface, here of a point cloud with three measured pixels of four, is
+
+        SurfacePointCloud
+        Frame,Source
+        0,0
+        x,y,z
+        0.5,10,7.25,-1.5,12,7.5
+        0.5,12,8,,,
+        End
 
     Args:
         lines: of the file, comments and empty ones left out.
 
     Raises:
-        InputError: no surface in it.
+        InputError: no surface in it, or a row of a point cloud that is not three numbers a pixel.
     """
-    begins = [i for i, line in enumerate(lines) if line.strip(" ,\r") in (*_SURFACES, _POINTS)]
-    if not begins:
+    begin = next((i for i, line in enumerate(lines) if line.strip(" ,\r") in (*_SURFACES, _POINTS)), None)
+    if begin is None:
         raise InputError(f"{path}: holds no surface; export the surface, not its profiles")
-    end = next(i for i in range(begins[0], len(lines) + 1) if i == len(lines) or lines[i].startswith("End"))
-    head, *rows = ([cell.strip() for cell in line.split(",")] for line in lines[begins[0] + 3 : end])
-    if lines[begins[0]].startswith(_POINTS):
-        numbers = np.array([float(cell or "nan") for row in rows for cell in row if is_number(cell or "nan")])
-        return measured_pixels(dict(zip("xyz", numbers[: len(numbers) // 3 * 3].reshape(-1, 3).T, strict=True)))
-    return measured_pixels(_columns_of_heights(head, rows))
+    end = next((i for i in range(begin, len(lines)) if lines[i].startswith("End")), len(lines))
+    heading, *rows = ([cell.strip() for cell in line.split(",")] for line in lines[begin + _SECTION_HEAD : end])
+    # The heading of heights holds their x; that of a point cloud says nothing.
+    is_cloud = lines[begin].startswith(_POINTS)
+    return measured_pixels(_columns_of_points(path, rows) if is_cloud else _columns_of_heights(heading, rows))
 
 
-def _columns_of_heights(head: list[str], rows: list[list[str]]) -> dict[str, Array]:
-    """Return x, y, z (N,) of the pixels of a surface of Gocator, all NaN where nothing was measured.
+def _columns_of_points(path: Path, rows: list[list[str]]) -> dict[str, Array]:
+    """Return x, y, z (N,), mm, of the pixels of a point cloud of Gocator, all NaN where nothing was measured.
+
+    A row holds x, y, z of each of its pixels, side by side. Empty cells after its last whole pixel are no pixel.
+
+    Raises:
+        InputError: a row with text, or whose numbers are not three a pixel: those after it would be of other axes.
+    """
+    cells: list[str] = []
+    for number, row in enumerate(rows, 1):
+        whole = len(row) // 3 * 3
+        if any(row[whole:]) or not all(is_number(cell or "nan") for cell in row):
+            where = f"{path}: row {number} of its point cloud has {len(row)} cells"
+            raise InputError(f"{where}, not x, y, z of each pixel; to fix: export the surface again, unedited")
+        cells += row[:whole]
+    pixels = np.array([float(cell or "nan") for cell in cells]).reshape(-1, 3)
+    return dict(zip("xyz", pixels.T, strict=True))
+
+
+def _columns_of_heights(heading: list[str], rows: list[list[str]]) -> dict[str, Array]:
+    """Return x, y, z (N,), mm, of the pixels of a surface of Gocator, all NaN where nothing was measured.
 
     Cells hold heights z. x is the heading of the column, y stands in the row's own column Y, else in its first cell.
     """
-    across = [i for i, name in enumerate(head) if is_number(name)]
+    across = [i for i, name in enumerate(heading) if is_number(name)]
     heights = [row for row in rows if "I" not in row[: across[0]]]  # brightness has rows of its own
     z = np.array([[float(row[i] or "nan") for i in across] for row in heights])
-    y = np.array([float(row[head.index("Y") if "Y" in head else 0]) for row in heights])
-    x = np.array([float(head[i]) for i in across])
+    y = np.array([float(row[heading.index("Y") if "Y" in heading else 0]) for row in heights])
+    x = np.array([float(heading[i]) for i in across])
     grid = np.broadcast_arrays(x, y[:, None], z)
     return {axis: np.where(np.isnan(z), np.nan, c).ravel() for axis, c in zip("xyz", grid, strict=True)}
 
@@ -234,7 +261,7 @@ def read_left_handed(path: Path) -> dict[str, Array]:
 
 
 def read_ptx(path: Path) -> dict[str, Array]:
-    """Return columns x, y, z, intensity (N,) of Leica's PTX, scanner frame; 0 0 0 where nothing was measured.
+    """Return columns x, y, z, intensity (N,) of Leica's PTX, scanner frame, m; 0 0 0 where nothing was measured.
 
     A scan begins with `_PTX_HEADER` lines: counts of columns and rows, and the scanner's pose.
 

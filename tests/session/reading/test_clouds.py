@@ -403,6 +403,25 @@ def test_surfaces_of_gocator_in_each_of_its_sections(tmp_path, section):
     assert np.array_equal(read_cloud(tmp_path / "scan.csv").points, [[0.5, 10, 7.25], [-1.5, 12, 7.5], [0.5, 12, 8]])
 
 
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ("1,0.5,10,7.25\n2,0.5,12,8\n", "row 1 of its point cloud has 4 cells"),  # counted rows: 8 numbers
+        ("0.5,10,7.25\nZ,0.5,12,8,-1,1\n", "row 2 of its point cloud has 6 cells"),
+    ],
+)
+def test_a_stray_cell_in_a_point_cloud_of_gocator_is_refused(tmp_path, rows, reason):
+    (tmp_path / "scan.csv").write_text(f"{GOCATOR}SurfacePointCloud\nFrame,Source\n0,0\nx,y,z\n{rows}End\n")
+    with pytest.raises(InputError, match=reason):
+        read_cloud(tmp_path / "scan.csv")
+
+
+def test_commas_at_the_ends_of_rows_of_gocator_are_no_points(tmp_path):
+    rows = "0.5,10,7.25,-1.5,12,7.5,\n0.5,12,8,,,,\n"
+    (tmp_path / "scan.csv").write_text(f"{GOCATOR}SurfacePointCloud\nFrame,Source\n0,0\nx,y,z\n{rows}End\n")
+    assert np.array_equal(read_cloud(tmp_path / "scan.csv").points, [[0.5, 10, 7.25], [-1.5, 12, 7.5], [0.5, 12, 8]])
+
+
 def ptx(T):
     """A scan of one column: the scanner's place, its three axes, then the matrix for rows of points."""
     place, axes = T[:3, 3], T[:3, :3].T
