@@ -124,7 +124,8 @@ def part_shape(fused: FusedCloud) -> PartShape:
 
         mesh = _drawn_in(mesh_of(points, normals, _OUTSIDE), points, normals)
         points, triangles = _level_edges(*_whole_pieces(mesh))
-        normals = igl.per_vertex_normals(points, triangles)
+        # A vertex whose triangles have no area has no normal.
+        normals = np.nan_to_num(igl.per_vertex_normals(points, triangles))
     return PartShape(points, normals, triangles)
 
 

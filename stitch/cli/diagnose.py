@@ -84,11 +84,10 @@ def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[
 
     preload_entry_points("stitch.diagnosis_reports")
     with opened_run(run, effects_file, trust, "diagnosing: reading the scans") as state:
-        # For the page: matched anew, beside the diagnosis.
-        history = begin(partial(model_history, state))
+        # For the page, which waits for it: matched anew, beside the diagnosis.
+        begin(partial(model_history, state))
         with show_activity("diagnosing: trying every effect"):
             diagnosis = diagnose(state)
-        history.result()
         return diagnosis, write_diagnosis(diagnosis, state, run)
 
 

@@ -1,5 +1,6 @@
 """The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
+from concurrent.futures import wait
 from dataclasses import replace
 from functools import partial
 
@@ -67,7 +68,7 @@ def _diagnose(state: RunData) -> Diagnosis:
     announce("diagnosing: what every view tells of its pose")
     linear = linear_model_of(state)
     # Sums over all points, which leave the interpreter to the questions that come before theirs.
-    begin(partial(lone_scanner_error, linear))
+    scanner_error = begin(partial(lone_scanner_error, linear))
     limit = scatter_limit(state.session)
     announce("diagnosing: trying every effect")
     candidates, missing = candidates_of(linear)
@@ -119,6 +120,8 @@ def _diagnose(state: RunData) -> Diagnosis:
         budget=budget.result(),
         answers=evidence.answers,
     )
+    # Nothing goes on after a diagnosis; who asked has its answer, or its error, already.
+    wait([scanner_error])
     sentence = diagnosis_sentence(diagnosis, state.session.length_unit, _pair_beside_each_other(linear, evidence))
     return replace(diagnosis, sentence=sentence)
 

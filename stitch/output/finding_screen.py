@@ -22,7 +22,7 @@ from stitch.diagnosis.effect_trend import (
 )
 from stitch.diagnosis.fitted_effect import EffectTrend
 from stitch.diagnosis.residual_structure import NOT_REPEATING, predicted_distances
-from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words
+from stitch.diagnosis.sentences import fitted_amounts, odds_text, unnamed_in_words, why_without_a_name
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
@@ -538,6 +538,10 @@ def certainty(diagnosis: Diagnosis) -> str:
             if repeating := reportable(diagnosis.repeating_errors, diagnosis.implausible):
                 odds = odds_text(max(error.log_bayes_factor for error in repeating))
                 return f"The odds that these errors repeat, and are no scatter, are {odds}."
+            if diagnosis.notes:
+                # An effect that was refuted is not said to come nearest.
+                why = why_without_a_name(diagnosis)
+                return f"{why[0].upper()}{why[1:]}: {diagnosis.notes[0]}."
     likeliest = next((c.ranked for c in diagnosis.candidates if c.ranked.score.observable), None)
     if likeliest is None:
         return "No known effect can be tested with these views."

@@ -204,10 +204,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         refuse_whole(session)
     # Before small steps are dropped: the warnings tell of them.
     doubts = _whole_session_warnings(session, capture, snooping)
-    if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
-        # A slip of the part, or a knock of the mount, that effects can describe is left to the diagnosis: no view
-        # beyond it is left out.
-        snooping = replace(snooping, steps=())
+    snooping = _without_small_steps(session, snooping)
     # Of few views the warnings weigh all poses together: no single one is suspected beside that.
     suspected = snooping.suspected if snooping.few is None else ()
     names = session.names
@@ -231,8 +228,18 @@ def _whole_session_warnings(session: SessionData, capture: Capture, snooping: Sn
         snooping: what the tests say.
     """
     of_stock = (problem.fix for problem in stock_problems(session, capture))
-    of_copies = _copies(session, capture, snooping)
+    of_copies = _copies(session, capture, _without_small_steps(session, snooping))
     return *target_warnings(session, capture.sightings), *of_stock, *of_copies, *snooping_warnings(session, snooping)
+
+
+def _without_small_steps(session: SessionData, snooping: Snooping) -> Snooping:
+    """Return what the tests say without steps, unless one is beyond what any arm does.
+
+    A slip of the part, or a knock of the mount, that effects can describe is left to the diagnosis: no view beyond it
+    is left out.
+    """
+    is_large = any(beyond_any_arm(session, *step.at_least) for step in snooping.steps)
+    return snooping if is_large else replace(snooping, steps=())
 
 
 def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:

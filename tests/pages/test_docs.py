@@ -336,3 +336,12 @@ def test_python_names_only_what_exists(page):
                 assert hasattr(import_module(node.module), alias.name), f"{node.module} has no {alias.name}"
         elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "stitch":
             assert node.attr in stitch.__all__
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "docs").glob("*.ipynb")), ids=lambda notebook: notebook.stem)
+def test_what_a_notebook_imports_is_there(notebook):
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    code = ast.parse("\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"))
+    imports = [statement for statement in code.body if isinstance(statement, ast.Import | ast.ImportFrom)]
+    assert imports
+    exec(compile(ast.Module(imports, []), notebook.name, "exec"), {})

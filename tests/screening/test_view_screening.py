@@ -1,6 +1,6 @@
 """Runs of sessions with blunders: named and left out, or refused; never fused in silence."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -163,8 +163,22 @@ def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
     assert found.screenings == [ViewScreening()] and found.sessions == [session]
 
 
-def test_copied_scans_are_warned_of_after_a_change_of_the_model_too(monkeypatch):
-    monkeypatch.setattr(view_screening, "_snoop_session", lambda *_: SimpleNamespace(left_out=()))
+@dataclass
+class FoundSteps:
+    """What tests of the views say: from a step on, the last view would not belong."""
+
+    steps: tuple
+
+    @property
+    def left_out(self):
+        return (2,) if self.steps else ()
+
+
+@pytest.mark.parametrize("steps", [(), (SimpleNamespace(at_least=(0.0, 0.0)),)])
+def test_copied_scans_are_warned_of_after_a_change_of_the_model_too(monkeypatch, steps):
+    """Beside a step that effects can describe, too: the views beyond it are fused."""
+    monkeypatch.setattr(view_screening, "_snoop_session", lambda *_: FoundSteps(steps))
+    monkeypatch.setattr(view_screening, "beyond_any_arm", lambda *_: False)
     monkeypatch.setattr(view_screening, "snooping_warnings", lambda *_: ())
     monkeypatch.setattr(view_screening, "stock_problems", lambda *_: [])
     scans = [SimpleNamespace(points=np.full((3, 3), value)) for value in (1.0, 2.0, 1.0)]
