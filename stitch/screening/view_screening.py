@@ -223,12 +223,19 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
 def _whole_session_warnings(session: SessionData, capture: Capture, snooping: Snooping) -> tuple[str, ...]:
     """Return the warnings of a session as a whole: its targets, stock, copied scans, and what the tests of views say.
 
+    Of two scans with the same points one may be left out: then they are no copies.
+
     Args:
         capture: of the session, without the effects in use.
         snooping: what the tests say.
     """
     of_stock = (problem.fix for problem in stock_problems(session, capture))
-    of_copies = _copies(session, capture, _without_small_steps(session, snooping))
+    left_out = _without_small_steps(session, snooping).left_out
+    kept = [v for v in range(len(capture.scans)) if v not in left_out]
+    copies = [
+        (v, w) for v, w in combinations(kept, 2) if np.array_equal(capture.scans[v].points, capture.scans[w].points)
+    ]
+    of_copies = (sentence("copies", views=f"{session.names[v]} and {session.names[w]}") for v, w in copies)
     return *target_warnings(session, capture.sightings), *of_stock, *of_copies, *snooping_warnings(session, snooping)
 
 
@@ -240,14 +247,6 @@ def _without_small_steps(session: SessionData, snooping: Snooping) -> Snooping:
     """
     is_large = any(beyond_any_arm(session, *step.at_least) for step in snooping.steps)
     return snooping if is_large else replace(snooping, steps=())
-
-
-def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:
-    """Yield a warning of every two scans with the same points, of which neither is left out."""
-    kept = [v for v in range(len(capture.scans)) if v not in snooping.left_out]
-    for v, w in combinations(kept, 2):
-        if np.array_equal(capture.scans[v].points, capture.scans[w].points):
-            yield sentence("copies", views=f"{session.names[v]} and {session.names[w]}")
 
 
 def _misplaced_views(session: SessionData, snooping: Snooping, poses: Array) -> tuple[ExcludedView, ...]:
