@@ -242,8 +242,8 @@ def _moved_by_overlaps(
 
     Args:
         gates: per session the largest distance between corresponding points at first, length_unit.
-        pairs_from: the views moved from a model near by, whose pairs of views that overlap are used again; None: they
-            are searched.
+        pairs_from: the views moved from a model near by: which of them overlap, and the nearest points that cannot
+            have changed, are used again; None: all is searched.
     """
     captures = tuple(corrected_capture(measurement, model) for measurement in measurements)
     overlaps_before = [None] * len(captures) if pairs_from is None else [free.overlaps for free in pairs_from]

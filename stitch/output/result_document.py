@@ -587,7 +587,7 @@ RESULT = Document(
     Key("targets", write=_target_rows),
     Key("position_error", _SIZES, "targets.distances", when=attrgetter("targets")),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
-    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=lambda r: r.targets and r.overlaps),
+    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=lambda r: r.targets and r.registered),
     Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_has_labelled_alone),
     Key("heldout_position_error", _SIZES, "targets.heldout", when=_has_labelled_alone),
     Key("convergence", table_of(_NUMBERS), of=Fit),

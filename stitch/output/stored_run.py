@@ -135,11 +135,10 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         model = bind_to_session(file, measurement)
         measurement = results.restore_counted_targets(measurement, session, document)
         fields = results.RESULT.fields(document, RunData)
-        stock = results.stock_of_views(document, session.names)
         if "gate" not in fields:
             # Earlier versions did not write it.
             fields["gate"] = gate_of_model(corrected_capture(measurement, model), model.T_mount)
-        if stock:
+        if stock := results.stock_of_views(document, session.names):
             # The result states thickness and sigma of the stock; its points are found again.
             capture = corrected_capture(measurement, model)
             stock = locate_stock(session, capture, model.T_mount, fields["gate"], stock)

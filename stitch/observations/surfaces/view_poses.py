@@ -50,7 +50,7 @@ def unconstrained_poses(
     Args:
         model_poses: T_reference_scanner (V, 4, 4), where the views begin.
         gate: largest distance between corresponding points in the first iteration, length_unit.
-        before: overlaps at poses near by, whose pairs of views are used again; None: they are searched.
+        before: overlaps at poses near by, whose search goes on (`collect_overlaps`); None: all is searched.
 
     Raises:
         NoResultError: no two views overlap.
