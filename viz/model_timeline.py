@@ -6,6 +6,7 @@ moment has the views.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,12 @@ from stitch.model.forward import true_geometry
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
-from stitch.observations.surfaces.matching import signed_distances
-from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.observations.surfaces.matching import Match, signed_distances
+from stitch.output.comparison.disagreement_field import DisagreementField, full_colour_distance
 from stitch.output.comparison.model_history import ModelHistory, ModelStep
 from stitch.run_data import RunData
 from stitch.session.scan import even_indices
-from stitch.system.threads import take_mapped
+from stitch.system.threads import parallel, take_mapped
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
 from viz.rrd_file import words
@@ -162,10 +163,27 @@ def log_model(
     places = one_above_the_other(at_rest, up)
     first = mean_sizes(scene.history.models[0].field.values) * scene.um
     recording.log("bars/first", rr.BarChart(first, color=GREY), static=True)
-    for moment in shown:
+    assert run.registered is not None
+    # Effects of the scanner move points by micrometres: those of the present model.
+    points = true_geometry(run.measurement, run.model)[1]
+    fields = parallel(partial(_field_at, scene.history, run.registered.matches, points), shown)
+    for moment, field in zip(shown, fields, strict=True):
         recording.set_time("iteration", sequence=moment.at)
-        _log_moment(recording, run, scene, moment, places)
+        _log_moment(recording, scene, moment, field, places)
         recording.reset_time()
+
+
+def _field_at(
+    history: ModelHistory, matches: Sequence[Match], points: Sequence[Array], moment: Shown
+) -> DisagreementField:
+    """The field of a step of the history, or of where a moment has the views.
+
+    Args:
+        points: per view (N, 3), scanner frame.
+    """
+    if moment.step is not None:
+        return history.steps[moment.step].field
+    return history.patches.field(signed_distances(matches, moment.poses, points))
 
 
 def one_above_the_other(views: Sequence[Array], up: Array) -> Array:
@@ -179,14 +197,10 @@ def one_above_the_other(views: Sequence[Array], up: Array) -> Array:
     return places
 
 
-def _log_moment(recording: rr.RecordingStream, run: RunData, scene: ModelScene, moment: Shown, places: Array) -> None:
-    """Log one moment; `places` (F, 3) carry the names of the farthest."""
-    assert run.registered is not None
-    field = None if moment.step is None else scene.history.steps[moment.step].field
-    if field is None:
-        # Effects of the scanner move points by micrometres: those of the present model.
-        points = true_geometry(run.measurement, run.model)[1]
-        field = scene.history.patches.field(signed_distances(run.registered.matches, moment.poses, points))
+def _log_moment(
+    recording: rr.RecordingStream, scene: ModelScene, moment: Shown, field: DisagreementField, places: Array
+) -> None:
+    """Log one moment with its field; `places` (F, 3) carry the names of the farthest."""
     recording.log("part/now", _colours(scene, field.overall))
     T = displaced(scene, moment.poses, moment.factor)
     for v in scene.farthest:

@@ -307,8 +307,8 @@ class Run(RunData):
 
         Example:
             >>> saved = run.save(folder / "runs" / "bracket", recording=False)
-            >>> tuple(sorted(path.name for path in saved.iterdir())[:3])
-            ('ledger.json', 'model.toml', 'report.html')
+            >>> tuple(sorted(path.name for path in saved.glob("*.json")))
+            ('ledger.json', 'result.json')
         """
         folder = Path(folder)
         _require_own_history(self, folder, force)

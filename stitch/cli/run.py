@@ -144,7 +144,6 @@ def run(
     several_scanners = have_own_hand_eyes(loaded)
     inner = [""] if len(loaded) == 1 or several_scanners else [session.name for session in loaded]
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
-    run_folder.preload_entry_points("stitch.reports", *(["stitch.recorders"] if recording else []))
     with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
         folders = [scratch / folder for folder in inner]
         for folder in folders:

@@ -15,12 +15,15 @@ from stitch.system.files import Ours, whole_file
 
 # Of result.json.
 FORMAT = "stitch-run/1"
+# Normals of the scans, for commands that read the run again.
+SCANS = ".scans.npz"
 # Every file that a command writes into a run folder. What is not listed here is never removed.
 FILES = {
     *("model.toml", "result.json", "ledger.json", "stitched.ply", "mesh.ply", "residuals.parquet", "recording.rrd"),
     *("report.html", "report.pdf", "two-runs.html", "two-runs.pdf", "features.json", "features.csv", "features.html"),
     *("compare.json", "witness.json", "witness.png", "diagnosis.json", "diagnosis.rrd", "robot.toml", "robot.urdf"),
     "model_effects.py",
+    SCANS,
 }
 # Earlier fits of the run, by what they were made of.
 FITS = ".fits"

@@ -23,7 +23,8 @@ from stitch.errors import InputError
 from stitch.model.model_toml import read_model, write_model
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import Match
-from stitch.output.json_file import FILES, FITS, is_run_file, require_free, write_json
+from stitch.output.comparison.model_history import model_history
+from stitch.output.json_file import FILES, FITS, SCANS, is_run_file, require_free, write_json
 from stitch.output.result_document import (
     effects_source,
     ledger,
@@ -34,6 +35,7 @@ from stitch.output.result_document import (
 )
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
+from stitch.session.kept_scans import write_scans
 from stitch.session.reading.session_folder import measured_files
 from stitch.session.session import SessionData
 from stitch.system.files import claim_folder, rewrite_folder
@@ -319,11 +321,13 @@ def write_with_page(
         record: tells a recorder all of the run, to its end: for recording.rrd, which continues one that lies there.
             None: it is not written.
     """
-    # Page and recording, which take longest, are made while all else is written.
+    # Page and recording, which take longest, are made while all else is written. The headline and both wait for the
+    # history; the libraries that they draw with take half a second to load, and would hold it up.
     with ThreadPoolExecutor(3) as threads:
+        points = threads.submit(_write_points, run, folder)
+        model_history(run)
         page = threads.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
         recording = threads.submit(_write_recording, folder, record)
-        points = threads.submit(_write_points, run, folder)
         write_numbers(run, folder)
         for written in (page, recording, points):
             written.result()
@@ -362,7 +366,10 @@ def _write_recording(folder: Path, record: Callable[[Recorder], None] | None) ->
 
 
 def _write_points(run: RunData, folder: Path) -> None:
-    """Write stitched.ply and, where pyarrow is installed, residuals.parquet into a folder."""
+    """Write stitched.ply, the scans' normals and, where pyarrow is installed, residuals.parquet into a folder."""
     write_cloud(run.fused, folder / "stitched.ply")
+    clouds = [view.cloud for view in run.session.views if view.cloud is not None]
+    if all(cloud.whole is None for cloud in clouds):
+        write_scans(run.measurement.capture.scans, [cloud.points for cloud in clouds], folder / SCANS)
     with unless_missing():
         write_residuals(run, folder / "residuals.parquet")

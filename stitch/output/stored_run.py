@@ -18,10 +18,12 @@ from stitch.numerics.frames import Array
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output import result_document as results
+from stitch.output.json_file import SCANS
 from stitch.output.schema import read_checked
 from stitch.run_data import Fit, FusedCloud, LedgerStep, RunData
 from stitch.screening.stock import locate_stock
 from stitch.session.capture import prepare_capture
+from stitch.session.kept_scans import read_scans
 from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
@@ -130,7 +132,8 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     session = whole_session.without([item.view for item in left_out])
     # The order is that of a run: views, model, points that count, stock. Each needs those before it.
     with library_threads_off():
-        whole = with_part_origin(measurement_of(whole_session, prepare_capture(whole_session)), file.T_mount_coarse)
+        capture = prepare_capture(whole_session, read_scans(folder / SCANS))
+        whole = with_part_origin(measurement_of(whole_session, capture), file.T_mount_coarse)
         measurement = whole.without([v for v, name in enumerate(whole_session.names) if name not in session.names])
         model = bind_to_session(file, measurement)
         measurement = results.restore_counted_targets(measurement, session, document)

@@ -12,6 +12,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.units import METRES
+from stitch.session.kept_scans import KeptScans
 from stitch.session.scan import (
     GRAZING_COSINE,
     Neighbourhoods,
@@ -188,17 +189,20 @@ class Capture:
         )
 
 
-def prepare_capture(session: SessionData) -> Capture:
+def prepare_capture(session: SessionData, kept: KeptScans | None = None) -> Capture:
     """Return the capture of a session: its scans made ready for matching, its labelled points, its chain of frames.
 
     Of labelled points without scans so many are used that the fit stays within memory (`_MOST_PRODUCTS`).
+
+    Args:
+        kept: scans that an earlier run made ready: those of the same points are taken from there. None: all anew.
 
     Raises:
         InputError: every cloud is one profile.
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    scans = _prepare_scans(session) if session.has_clouds else ()
+    scans = _prepare_scans(session, kept or KeptScans({})) if session.has_clouds else ()
     if scans and not any((scan.confidence > GRAZING_COSINE).any() for scan in scans):
         raise InputError(
             f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
@@ -237,29 +241,39 @@ def build_capture(
     return Capture(name, tuple(scans), frames.inverse(T_base_flange), still, sightings=sightings)
 
 
-def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
+def _prepare_scans(session: SessionData, kept: KeptScans) -> tuple[Scan, ...]:
     """Return the scans of all views that have a cloud, made ready for matching on all cores.
 
     Where memory allows, the neighbours of all points are found first. The library does that without the interpreter's
     lock, which other threads that still import modules hold again and again.
+
+    Args:
+        kept: scans that need not be made again.
     """
     # Each view with its scanner's description; of several scanners each has a session.
     scanners = [part.scanner for part in session.parts] or [session.scanner]
     seen = [(scanners[view.scanner], view.cloud) for view in session.views if view.cloud is not None]
-    clouds = [cloud for _, cloud in seen]
-    whole = [None if cloud.whole is not None else cloud.points for cloud in clouds]
-    around: Iterable[Neighbourhoods | None] = [None] * len(whole)
-    if sum(len(points) for points in whole if points is not None) <= _AT_ONCE:
-        around = list(parallel(lambda points: None if points is None else find_neighbourhoods(points), whole))
 
-    def prepared(item: tuple[str, tuple[Scanner, Cloud], Neighbourhoods | None]) -> Scan:
-        """Return the scan of one view; of a thinned cloud the one that was made from all points."""
-        name, (scanner, cloud), neighbours = item
+    def known(item: tuple[str, tuple[Scanner, Cloud]]) -> Scan | None:
+        """Return the scan of one view where it is made already: that of a thinned cloud's points, or a kept one."""
+        name, (scanner, cloud) = item
         if cloud.whole is not None:
             return cloud.whole.scan
-        return prepare_scan(name, cloud.points, eye=scanner.eye(cloud.points), around=neighbours)
+        return kept.scan(name, cloud.points, scanner.eye(cloud.points)) if kept.found else None
 
-    return tuple(parallel(prepared, zip(session.names, seen, around, strict=True), "preparing scans"))
+    scans = list(parallel(known, zip(session.names, seen, strict=True)))
+    clouds = [cloud.points if scan is None else None for scan, (_, cloud) in zip(scans, seen, strict=True)]
+    around: Iterable[Neighbourhoods | None] = [None] * len(clouds)
+    if sum(len(points) for points in clouds if points is not None) <= _AT_ONCE:
+        around = list(parallel(lambda points: None if points is None else find_neighbourhoods(points), clouds))
+
+    def prepared(item: tuple[str, Scan | None, tuple[Scanner, Cloud], Neighbourhoods | None]) -> Scan:
+        """Return the scan of one view."""
+        name, scan, (scanner, cloud), neighbours = item
+        return scan or prepare_scan(name, cloud.points, eye=scanner.eye(cloud.points), around=neighbours)
+
+    items = zip(session.names, scans, seen, around, strict=True)
+    return tuple(parallel(prepared, items, "preparing scans"))
 
 
 def sightings_of(session: SessionData) -> Sightings | None:

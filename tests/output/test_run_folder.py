@@ -8,7 +8,7 @@ A run read back from its folder; the Python file that its model names is run onl
 import json
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +29,17 @@ from stitch.errors import InputError, NoResultError
 from stitch.model.model_toml import read_model
 from stitch.numerics import frames
 from stitch.output import run_folder
-from stitch.output.json_file import is_run_file, require_free, sessions_in
+from stitch.output.json_file import SCANS, is_run_file, require_free, sessions_in
 from stitch.output.result_document import model_of
 from stitch.output.run_folder import restore_fit, write_with_page
 from stitch.output.stored_run import diagnosed_state, load_run, trusted_model
 from stitch.recorder import SilentRecorder
 from stitch.run_data import LedgerStep
+from stitch.session import capture
+from stitch.session.capture import prepare_capture
+from stitch.session.kept_scans import read_scans
 from stitch.session.reading.session_folder import load_session
+from stitch.session.scan import prepare_scan
 from tests.command_line import ended
 from viz import run_page
 from viz.page_parts import sections_of, with_sections
@@ -67,6 +71,45 @@ def page(run):
 
 def files(run):
     return {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+
+
+@pytest.fixture
+def prepared_anew(monkeypatch):
+    """Names of the views whose scans are made ready by computation."""
+    names = []
+    monkeypatch.setattr(
+        capture, "prepare_scan", lambda name, *points, **at: names.append(name) or prepare_scan(name, *points, **at)
+    )
+    return names
+
+
+def test_scans_that_a_run_made_ready_are_taken_from_its_folder(folder, prepared_anew):
+    anew = prepare_capture(load_session(folder / "s")).scans
+    prepared_anew.clear()
+    for kept, scan in zip(load_run(folder / "r").measurement.capture.scans, anew, strict=True):
+        for field in fields(scan):
+            if field.name != "tree":
+                np.testing.assert_array_equal(getattr(kept, field.name), getattr(scan, field.name), field.name)
+        np.testing.assert_array_equal(kept.tree.query(scan.points, k=2)[1], scan.tree.query(scan.points, k=2)[1])
+    assert prepared_anew == []
+
+
+def test_a_scan_that_changed_in_its_last_digit_is_made_anew(folder, prepared_anew):
+    session = load_session(folder / "s")
+    view = session.views[1]
+    points = view.cloud.points.copy()
+    points[7, 2] = np.nextafter(points[7, 2], 0)
+    views = (session.views[0], replace(view, cloud=replace(view.cloud, points=points)), *session.views[2:])
+    prepare_capture(replace(session, views=views), read_scans(folder / "r" / SCANS))
+    assert prepared_anew == [view.name]
+
+
+@pytest.mark.parametrize("damage", [lambda file: file.write_bytes(file.read_bytes()[:999]), Path.unlink])
+def test_without_its_kept_scans_a_run_reads_as_before(folder, tmp_path, damage):
+    copy = shutil.copytree(folder / "r", tmp_path / "r")
+    damage(copy / SCANS)
+    for kept, anew in zip(*(load_run(path).measurement.capture.scans for path in (folder / "r", copy)), strict=True):
+        np.testing.assert_array_equal(kept.normals, anew.normals)
 
 
 def test_a_model_that_is_used_as_it_is_stays_as_it_is(folder):
@@ -161,7 +204,7 @@ def test_nothing_of_the_old_model_stays_beside_the_new_one(changing, stitch_comm
     run, _ = changing
     stitch_command("drop", run, EFFECT, "--no-recording")
     assert {path.name for path in run.iterdir() if path.is_file()} == {
-        "model.toml", "result.json", "ledger.json", "stitched.ply", "residuals.parquet", "report.html",
+        "model.toml", "result.json", "ledger.json", "stitched.ply", "residuals.parquet", "report.html", SCANS,
     }  # fmt: skip
 
 
