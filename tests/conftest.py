@@ -17,6 +17,7 @@ from stitch.cli.report import printing_browser
 from stitch.diagnosis import candidates
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
+from stitch.system.process import keep_freed_memory
 from stitch.system.threads import library_threads_off
 from tests.command_line import ended
 from tests.in_browser import DRAWN
@@ -28,6 +29,9 @@ if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):
 
 # What a command prints does not hang on how long the machine takes.
 os.environ.setdefault("STITCH_PROGRESS", "off")
+
+# As the command line does.
+keep_freed_memory()
 
 # As inside a run: the tests call the stages directly.
 library_threads_off()

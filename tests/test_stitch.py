@@ -145,6 +145,38 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
     assert not loaded(f"import {module}") & (DEAR | also_without)
 
 
+CLEARED = """
+import resource
+from threading import Thread
+import numpy as np
+from stitch.system import process
+{first}
+
+def work():
+    for _ in range(200):
+        np.ones(500_000)
+
+work()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(2):
+    thread = Thread(target=work)
+    thread.start()
+    thread.join()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's allocator")
+def test_memory_that_was_freed_is_not_cleared_again():
+    """Two threads, each with an array of 4 MB, a thousand pages, made and freed 200 times."""
+
+    def cleared(first):
+        out = subprocess.run([sys.executable, "-c", CLEARED.format(first=first)], capture_output=True, check=True)
+        return int(out.stdout)
+
+    assert cleared("process.keep_freed_memory()") < 3_000 < cleared("process.return_large_arrays()") / 10
+
+
 def test_a_run_loads_nothing_of_the_diagnosis():
     """Nor of plug-ins, pictures and meshes: all that it needs from the first file to the page."""
     on_use = "from stitch.system.process import load_on_use; load_on_use('numpy.f2py', 'numpy.testing')\n"

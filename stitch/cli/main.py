@@ -71,6 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Before a library is loaded that has threads of its own: one that comes later would fight ours for the cores.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    if arguments is None:
+        process.keep_freed_memory()
     speak_any_terminal()
     time_limit.may_end_process()
     try:

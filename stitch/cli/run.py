@@ -155,7 +155,8 @@ def run(
             loaded, captures = [join_scanners(loaded, model, kept, captures)], None
         method = register or DEFAULT
         runs = run_rig(loaded, model, recorders, named, keep, kept, register=method, captures=captures)
-        runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
+        if own_effects:
+            runs = [replace(result, effects_file=own_effects) for result in runs]
         with ThreadPoolExecutor(1) as writer:
             written = writer.submit(_write_runs, runs, folders, records, scratch, mesh, tolerance)
             if not as_json:

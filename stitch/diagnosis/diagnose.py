@@ -38,8 +38,8 @@ from stitch.fit.pipelines import linearise
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData
-from stitch.system.process import announce
-from stitch.system.threads import begin, library_threads_off, parallel, return_large_arrays
+from stitch.system.process import announce, return_large_arrays
+from stitch.system.threads import begin, library_threads_off, parallel
 
 
 def diagnose_state(state: RunData) -> Diagnosis:

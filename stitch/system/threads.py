@@ -4,10 +4,8 @@ Queries of one pair are too small to share out, and two libraries that both spin
 slow each other down twentyfold; so libraries run single-threaded inside a run.
 """
 
-import ctypes
 import mmap
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -26,12 +24,6 @@ from stitch.system.process import steps
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-# As mallopt(3) of glibc numbers them: allocations from so many bytes on are mappings of their own, and what is free at
-# the top of a heap beyond so many goes back.
-_MMAP_THRESHOLD = -3
-_TRIM_THRESHOLD = -1
-_MAPPED_BYTES = 2_000_000
-_TOP_BYTES = 20_000_000
 # A mapped array is looked at in so many parts.
 _PARTS = 64
 # Of a long loop: enough of them to keep all cores busy to its end.
@@ -104,19 +96,6 @@ def begin(function: Callable[[], Result]) -> Future[Result]:
 def library_threads_off() -> Any:
     """Limit OpenMP and BLAS to one thread; also a context manager. OpenMP counts per calling thread."""
     return threadpool_limits(1)
-
-
-@cache
-def return_large_arrays() -> None:
-    """Make glibc return arrays of 2 MB and more to the system as soon as they are freed; elsewhere do nothing.
-
-    By itself glibc raises that limit to 32 MB. Freed arrays of thousands of poses then stay in the heap of every
-    thread: a third more memory than is in use. The price is a new mapping for each array, too much for small sessions.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)
-        mallopt(_TRIM_THRESHOLD, _TOP_BYTES)
 
 
 def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:

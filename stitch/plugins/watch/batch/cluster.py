@@ -11,6 +11,7 @@ from typing import Any
 
 from stitch.errors import InputError
 from stitch.system.packages import command_for
+from stitch.system.process import KEPT_ARRAY_BYTES, KEPT_BYTES
 
 _ANSWER_SECONDS = 10.0  # seconds within which a scheduler has to answer
 _SETTINGS = {
@@ -23,6 +24,10 @@ _SETTINGS = {
     "distributed.admin.tick.interval": "1s",
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
+    # As the command line does for its own process; by itself Dask has workers give all memory back at once.
+    "distributed.nanny.pre-spawn-environ.MALLOC_ARENA_MAX": 1,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": KEPT_ARRAY_BYTES,
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": KEPT_BYTES,
 }
 
 
