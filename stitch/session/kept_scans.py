@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -67,7 +66,7 @@ def read_scans(path: Path) -> KeptScans:
             }
             rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
             return KeptScans({digest.tobytes(): row for digest, row in zip(table["digests"], rows, strict=True)})
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except Exception:  # whatever is wrong with it, the scans can be prepared anew
         return KeptScans({})
 
 

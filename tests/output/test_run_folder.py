@@ -104,7 +104,16 @@ def test_a_scan_that_changed_in_its_last_digit_is_made_anew(folder, prepared_ane
     assert prepared_anew == [view.name]
 
 
-@pytest.mark.parametrize("damage", [lambda file: file.write_bytes(file.read_bytes()[:999]), Path.unlink])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        Path.unlink,
+        lambda file: file.write_bytes(b""),
+        lambda file: file.write_bytes(file.read_bytes()[:999]),
+        lambda file: np.savez(file, counts=[3, 3]),
+        lambda file: file.write_text("normals"),
+    ],
+)
 def test_without_its_kept_scans_a_run_reads_as_before(folder, tmp_path, damage):
     copy = shutil.copytree(folder / "r", tmp_path / "r")
     damage(copy / SCANS)
