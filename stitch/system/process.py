@@ -25,8 +25,8 @@ AGAIN = 10.0
 _ends_at_once = False
 # As mallopt(3) numbers them.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-# From so many bytes on an array is a mapping of its own, glibc's largest; what stays at the top of a heap; both where
-# memory is short.
+# Arrays from so many bytes on go back to the system when they are freed (glibc allows no more), and so much that is
+# free stays at the top of a heap; then both where memory is short.
 KEPT_ARRAY_BYTES, KEPT_BYTES = 32 * 2**20, 512 * 2**20
 _MAPPED_BYTES, _TOP_BYTES = 2_000_000, 20_000_000
 
