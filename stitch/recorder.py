@@ -86,6 +86,12 @@ class RecorderMemory:
         for call, arguments in self.calls:
             getattr(recorder, call)(*arguments)
 
+    def hand_over(self, recorder: Recorder) -> None:
+        """Make all stored calls on another recorder and forget them; another thread may store more meanwhile."""
+        while self.calls:
+            call, arguments = self.calls.pop(0)
+            getattr(recorder, call)(*arguments)
+
 
 class RunMemory(RecorderMemory):
     """A recorder that stores the calls of several runs that are tried in turn, to replay those of the chosen one."""

@@ -77,9 +77,14 @@ class FusedCloud(Value):
     count: Array  # (N,) number of views that see the place
 
 
-@dataclass(frozen=True)
-class Unsupported:
-    """Numbers of scanned points, and of those that are not in the stitched cloud."""
+@dataclass(frozen=True, eq=False)
+class Unsupported(Value):
+    """Numbers of scanned points, and of those that are not in the stitched cloud.
+
+    Example:
+        >>> run.fit.fusion.unsupported.share < 0.01
+        True
+    """
 
     points: int = 0  # scanned points, in the cloud or not
     alone: int = 0  # on no surface of their own view or of others
@@ -94,6 +99,20 @@ class Unsupported:
     def share(self) -> float:
         """The share of all scanned points that are not in the stitched cloud, 0 to 1."""
         return (self.alone + self.looked_through) / max(self.points, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Fusion(Value):
+    """What the stage fuse makes of registered views; lengths in length_unit.
+
+    Example:
+        >>> run.fit.fusion.stage.name, run.fit.fusion.cloud.points.shape[1]
+        ('fuse', 3)
+    """
+
+    cloud: FusedCloud
+    unsupported: Unsupported = field(default_factory=Unsupported)
+    stage: StageResult | None = None  # None: targets stand in for a cloud
 
 
 @dataclass(frozen=True)
@@ -141,16 +160,18 @@ class LedgerStep:
 class Fit(Value):
     """What the stages found of one session under its model; lengths in length_unit, angles in rad.
 
+    `fusion_source` is what fuse made of it; while a thread still fuses, it is a function that waits for that.
+
     Example:
         >>> run.fit.poses.shape, run.fit.corrections.shape
         ((5, 4, 4), (5, 6))
     """
 
-    stages: tuple[StageResult, ...]
+    stages_before: tuple[StageResult, ...]  # fuse
     poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
     poses: Array  # (V, 4, 4) T_reference_scanner after register
     view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
-    fused: FusedCloud
+    fusion_source: Fusion | Callable[[], Fusion] = field(compare=False)
     repeatability: Repeatability  # of the flange poses, as the overlaps show it
     verdict: str  # one plain sentence
     convergence: dict[str, list[float]]  # stage -> rms per iteration
@@ -163,9 +184,40 @@ class Fit(Value):
     unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
     unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz of the hand-eye: what those directions leave open
     notes: tuple[str, ...] = ()
-    unsupported: Unsupported = field(default_factory=Unsupported)
     # (6,) sigma of the hand-eye with usual sizes of what these views cannot show, as `hand_eye_sigma` counts
     sigma_anywhere: Array | None = None
+
+    @property
+    def fusion(self) -> Fusion:
+        """What fuse made of the views; waits where they are still being fused.
+
+        Raises:
+            InputError: a scan changed on disk since it was read.
+        """
+        if not isinstance(self.fusion_source, Fusion):
+            # Of a function only the result is kept: a copy has no thread to wait for.
+            vars(self)["fusion_source"] = self.fusion_source()
+        assert isinstance(self.fusion_source, Fusion)
+        return self.fusion_source
+
+    @property
+    def fused(self) -> FusedCloud:
+        """The stitched cloud."""
+        return self.fusion.cloud
+
+    @property
+    def stages(self) -> tuple[StageResult, ...]:
+        """Rows of the stage table: coarse, correct, register, fuse."""
+        return self.stages_before if self.fusion.stage is None else (*self.stages_before, self.fusion.stage)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Wait for fuse, since a thread cannot be copied."""
+        return vars(self) | {"fusion_source": self.fusion}
+
+    def _stored(self) -> dict[str, Any]:
+        stored = super()._stored() | {"stages": self.stages, "fusion": self.fusion}
+        del stored["stages_before"]
+        return stored
 
 
 @dataclass(frozen=True)

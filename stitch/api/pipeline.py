@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stitch.api.rig import require_effects, require_measured_once, require_same_arm, require_same_rig
 from stitch.errors import NoResultError
@@ -87,6 +87,8 @@ def run_rig(
     *,
     register: str = DEFAULT,
     captures: Sequence[Future[Capture]] | None = None,
+    effects_file: str | None = None,
+    on_registered: Callable[[list[RunData]], None] | None = None,
 ) -> list[RunData]:
     """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run per session.
 
@@ -96,6 +98,8 @@ def run_rig(
         recorders: one a session, told of every stage; None: nobody is.
         effects, keep, arm, register: as of `run`.
         captures: what `prepare_capture` returns for each session, where that has begun already; None: it is made here.
+        effects_file: path of the user's Python file of effects, where no `model` names one.
+        on_registered: called with the runs while their views are still being fused: what needs the cloud waits for it.
 
     Raises:
         InputError, NoResultError: as of `run`, and sessions that cannot share a rig.
@@ -131,18 +135,25 @@ def run_rig(
             elif model:
                 screened = _check_against_own_model(screened, effects, model)
             notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
-            finished = conductor.finish()
-        alone = () if model else _each_alone(screened.sessions[0], arm)
-        runs = []
-        for i, screening in enumerate(screened.screenings):
-            names = sessions[i].names
-            left_out = sorted(screening.left_out, key=lambda item: names.index(item.view))
-            screening = replace(screening, left_out=tuple(left_out), doubts=(*doubts, *screening.doubts))
-            session, fitted = screened.sessions[i], screened.fitted
-            run = _assemble_run(
-                session, i, fitted, hand_eyes[i], finished[i], screening, keep=keep, notes=notes, alone=alone
-            )
-            runs.append(replace(run, effects_file=model.effects_file if model else None))
+            alone = () if model else _each_alone(screened.sessions[0], arm)
+            conductor.wait_for_covariance()
+            limits = [_hand_eye_limits(s, i, screened.fitted, hand_eyes[i]) for i, s in enumerate(screened.sessions)]
+            registered = conductor.registered()
+            runs = []
+            for i, screening in enumerate(screened.screenings):
+                names = sessions[i].names
+                left_out = sorted(screening.left_out, key=lambda item: names.index(item.view))
+                screening = replace(screening, left_out=tuple(left_out), doubts=(*doubts, *screening.doubts))
+                session, fitted = screened.sessions[i], screened.fitted
+                fit, floor = registered[i]
+                known = replace(fit, **limits[i]), floor
+                run = _assemble_run(
+                    session, i, fitted, hand_eyes[i], known, screening, keep=keep, notes=notes, alone=alone
+                )
+                runs.append(replace(run, effects_file=model.effects_file if model else effects_file))
+            if on_registered is not None:
+                on_registered(runs)
+            conductor.finish(runs)
         for run, recorder in zip(runs, recorders, strict=True):
             recorder.finish(run)
         return runs
@@ -303,7 +314,7 @@ def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile 
 
 
 class _Conductor:
-    """Fits the sessions of a rig, and registers and fuses their views in other threads while they are screened.
+    """Fits the sessions of a rig; registers their views in other threads while they are screened, and fuses them.
 
     Nearly always all views belong, and the work is not in vain. What was begun for views that are then left out ends
     with its next iteration.
@@ -340,7 +351,8 @@ class _Conductor:
         """Return the fit of these views, and begin in other threads to register and to fuse them.
 
         The screening calls this again each time it leaves views out; what was begun before is then stopped. This
-        thread fits. One further thread registers and fuses the views, another computes the hand-eye's covariance.
+        thread fits. One further thread registers the views and begins another that fuses them; one more computes the
+        hand-eye's covariance.
         """
         self.close()
         # A recorder that was told of a session with more views starts again.
@@ -354,12 +366,12 @@ class _Conductor:
         until_screened = partial(_wait_until_screened, self._screened, self._memories[0])
         # The thread gets what it works with as arguments, since a later call of `fit` replaces the fields.
         arguments = sessions, fitted, self._memories, self._seconds, until_screened
-        self._finished = begin(partial(self._register_and_fuse, *arguments))
+        self._registered = begin(partial(self._register_sessions, *arguments))
         # `hand_eye` is a cached property: read here, it is at hand when the run is assembled.
         self._statistics = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
         return fitted
 
-    def _register_and_fuse(
+    def _register_sessions(
         self,
         sessions: Sequence[SessionData],
         fitted: FittedRig,
@@ -371,7 +383,7 @@ class _Conductor:
 
         Args:
             fitted: hand-eye and effects of the whole rig.
-            memories: one a session; they store what `finish` replays, so that views left out later are never shown.
+            memories: one a session; they store what recorders are told later: of views left out they never hear.
             seconds: time that the fit has taken.
             until_screened: called before whole clouds are read to fuse them, see `_wait_until_screened`.
         """
@@ -380,17 +392,34 @@ class _Conductor:
         every = enumerate(zip(sessions, self._coarse, memories, strict=True))
         return [finish(session, fitted, i, coarse, memory) for i, (session, coarse, memory) in every]
 
-    def finish(self) -> list[tuple[Fit, float]]:
+    def registered(self) -> list[tuple[Fit, float]]:
         """Return, a session each, what the stages found and the rms that perfect poses would leave (length_unit).
 
-        Lets fusion begin, waits for both threads, and replays their calls to the recorders.
+        Waits for the registration, and tells the recorders what is done so far.
         """
-        self._screened.set()
-        fits = self._finished.result()
-        for memory, recorder in zip(self._memories, self._recorders, strict=True):
-            memory.replay(recorder)
-        self._statistics.result()
+        fits = self._registered.result()
+        self._tell_recorders()
         return fits
+
+    def wait_for_covariance(self) -> None:
+        """Let fusion begin, as the views are screened, and wait until the hand-eye's covariance is known."""
+        self._screened.set()
+        self._statistics.result()
+
+    def finish(self, runs: Sequence[RunData]) -> None:
+        """Wait until the views of the runs are fused, and tell the recorders.
+
+        Raises:
+            InputError: a scan changed on disk since it was read.
+        """
+        for run in runs:
+            _ = run.fit.fusion
+        self._tell_recorders()
+
+    def _tell_recorders(self) -> None:
+        """Make the calls that the threads' memories hold on the recorders."""
+        for memory, recorder in zip(self._memories, self._recorders, strict=True):
+            memory.hand_over(recorder)
 
     def close(self) -> None:
         """Stop the threads that were begun: each ends at its next call of a recorder, or when it waits to fuse."""
@@ -494,7 +523,7 @@ def _assemble_run(
     index: int,
     fitted: FittedRig,
     start: CoarseHandEye,
-    finished: tuple[Fit, float],
+    registered: tuple[Fit, float],
     screening: ViewScreening,
     *,
     keep: bool = False,
@@ -507,25 +536,25 @@ def _assemble_run(
         index: of the session in the rig.
         fitted: hand-eye and effects of the whole rig.
         start: the hand-eye before the correction, and where it is from.
-        finished: the session registered and fused, and the rms that perfect poses would leave, length_unit.
+        registered: the session registered, and the rms that perfect poses would leave, length_unit.
         screening: which of its views belong, and what is to be doubted.
         keep: views that do not belong were fused all the same: they are noted as kept, and none as left out.
         notes: sentences on what the sessions share.
         alone: of several scanners, the hand-eye of each from its own views; where they contradict the common fit, the
             run gets doubts.
     """
-    fit, noise_floor = finished
+    fit, noise_floor = registered
     model = fitted.model_of(index)
     left_out, kept = ((), screening.left_out) if keep else (screening.left_out, ())
     notes_on_views = view_notes(left_out, kept, screening.suspected)
     notes_on_fit = pipeline_for(session).notes(session, fitted, index, start)
     fit = replace(
-        _with_hand_eye_limits(fit, session, index, fitted, start),
+        fit,
         targets=fitted.sessions[index].targets,
         outliers=fitted.sessions[index].outliers,
         notes=(*notes_on_views, *notes_on_fit, *session_notes(session), *notes),
     )
-    residual_rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
+    residual_rms = next(stage.rms for stage in fit.stages_before if stage.name == "correct")
     heldout_rms = fitted.heldout_rms(index)
     values = {term.name: {p.name: p.value for p in term.parameters} for term in model.terms}
     first_step = LedgerStep(tuple(model.effects), residual_rms, heldout_rms, noise_floor, model.T_mount, values)
@@ -539,7 +568,7 @@ def _assemble_run(
         heldout_rms=heldout_rms,
         noise_floor=noise_floor,
         source=fit,
-        register_method=next((stage.method for stage in fit.stages if stage.method), ""),
+        register_method=next((stage.method for stage in fit.stages_before if stage.method), ""),
         ledger=(first_step,),
         doubts=screening.doubts,
         left_out=left_out,
@@ -552,8 +581,8 @@ def _assemble_run(
     return run
 
 
-def _with_hand_eye_limits(fit: Fit, session: SessionData, index: int, fitted: FittedRig, start: CoarseHandEye) -> Fit:
-    """Return a fit with what its views do not show of the hand-eye: directions, numbers, and sigma anywhere.
+def _hand_eye_limits(session: SessionData, index: int, fitted: FittedRig, start: CoarseHandEye) -> dict[str, Any]:
+    """Return by field of `Fit` what the views do not show of the hand-eye: directions, numbers, and sigma anywhere.
 
     Args:
         index: of the session in the rig.
@@ -565,10 +594,10 @@ def _with_hand_eye_limits(fit: Fit, session: SessionData, index: int, fitted: Fi
     captures = fitted.captures if session.has_clouds else [fitted.captures[index]]
     # Where several sessions share a hand-eye no joint has one place for all.
     joints = session.joints if len(captures) == 1 else None
-    fit = replace(fit, unobservable=unobservable(captures, T_mount, session.robot, joints))
+    limits: dict[str, Any] = {"unobservable": unobservable(captures, T_mount, session.robot, joints)}
     if start.source == REUSED:
-        return fit
-    return replace(fit, unknown=unknown_numbers(captures, T_mount), sigma_anywhere=_sigma_anywhere(fitted, index))
+        return limits
+    return limits | {"unknown": unknown_numbers(captures, T_mount), "sigma_anywhere": _sigma_anywhere(fitted, index)}
 
 
 def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
@@ -594,9 +623,13 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         with closing(_Conductor([session], start, [coarse], [recorder], register)) as conductor:
             fitted = conductor.fit([session], [measurement])
             warnings = session_warnings(session, fitted.sessions[index].measurement, fitted.correction, index)
-            (finished,) = conductor.finish()
-        screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
-        run = _assemble_run(session, index, fitted, hand_eye, finished, screening, alone=state.alone)
+            conductor.wait_for_covariance()
+            limits = _hand_eye_limits(session, index, fitted, hand_eye)
+            ((fit, floor),) = conductor.registered()
+            screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
+            known = replace(fit, **limits), floor
+            run = _assemble_run(session, index, fitted, hand_eye, known, screening, alone=state.alone)
+            conductor.finish([run])
         run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
         recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}

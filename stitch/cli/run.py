@@ -6,8 +6,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -153,15 +152,19 @@ def run(
         records = [memory.replay if recording else None for memory in memories]
         if several_scanners:
             loaded, captures = [join_scanners(loaded, model, kept, captures)], None
-        method = register or DEFAULT
-        runs = run_rig(loaded, model, recorders, named, keep, kept, register=method, captures=captures)
-        if own_effects:
-            runs = [replace(result, effects_file=own_effects) for result in runs]
-        with ThreadPoolExecutor(1) as writer:
-            written = writer.submit(_write_runs, runs, folders, records, scratch, mesh, tolerance)
-            if not as_json:
-                _show_runs(runs, tolerance)
-            mesh_fits = written.result()
+        runs = run_rig(
+            loaded,
+            model,
+            recorders,
+            named,
+            keep,
+            kept,
+            register=register or DEFAULT,
+            captures=captures,
+            effects_file=own_effects,
+            on_registered=None if as_json else partial(_show_runs, tolerance=tolerance),
+        )
+        mesh_fits = _write_runs(runs, folders, records, scratch, mesh, tolerance)
     if as_json:
         documents = [result_document(result) for result in runs]
         emit(json_file.to_json(documents[0] if len(documents) == 1 else documents))

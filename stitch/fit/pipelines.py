@@ -54,7 +54,7 @@ class Pipeline(Protocol):
         method: str,
         until_screened: Callable[[], None],
     ) -> tuple[Fit, float]:
-        """Return the result of session `index`, its views registered and fused, and its noise floor, length_unit.
+        """Return the result of session `index`, its views registered, and its noise floor, length_unit.
 
         It runs in a background thread while the views are screened; where the screening leaves views out, the recorder
         raises an exception that ends it.

@@ -28,10 +28,10 @@ from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, noise_floor, unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.recorder import Recorder
-from stitch.run_data import Fit, StageResult
+from stitch.run_data import Fit, Fusion, StageResult
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
-from stitch.system.threads import Clock, take_mapped
+from stitch.system.threads import Clock, begin, take_mapped
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
 _RMS_SAMPLES = 2_000_000
@@ -153,18 +153,17 @@ def register_session(
     method: str,
     until_screened: Callable[[], None],
 ) -> tuple[Fit, float]:
-    """Return the result of session `index` of a rig, its views registered and fused, and its noise floor, length_unit.
+    """Return the result of session `index` of a rig, its views registered, and its noise floor, length_unit.
+
+    A further thread fuses the views: the result's `fusion` waits for it.
 
     Args:
         fitted: all sessions of the rig with their common model.
         coarse: result of the stage before the fit.
-        recorder: is shown the stages correct, register and fuse.
+        recorder: is shown the stages correct, register and, by that thread, fuse.
         seconds: time that the fit has taken.
         method: by which surfaces are registered: dpwvm, gicp or vmm.
         until_screened: blocks until the screening has left all views in.
-
-    Raises:
-        InputError: a scan changed on disk since it was read.
     """
     correction, measurement = fitted.correction, fitted.sessions[index].measurement
     assert correction is not None
@@ -175,25 +174,18 @@ def register_session(
     corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note if is_noisy else "")
     recorder.stage(corrected, poses_model)
     registration, registered = _register_views(session, correction, index, recorder, method)
-    if has_whole_clouds(session):
-        # Every point is then read from the files again, which takes time and memory: only for views that stay.
-        until_screened()
-    clock = Clock()
-    fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
-    several = int((fused.count > 1).sum())
-    note = support_note(unsupported)
-    last = StageResult("fuse", _fused_rms(fused.residual), several, iterations=1, seconds=clock.lap(), note=note)
-    recorder.stage(last, registration.poses)
+    # Nothing that people wait for needs the cloud.
+    placed = RegisteredSession(session, measurement, model, capture, registration.poses)
+    fusing = begin(partial(_fuse_views, placed, recorder, until_screened))
     floor = noise_floor(capture, registration.overlaps, session.scanner.noise)
     scatter = correction.scatter[index]
     fit = Fit(
-        stages=(coarse, corrected, registered, last),
+        stages_before=(coarse, corrected, registered),
         poses_model=poses_model,
         poses=registration.poses,
         corrections=frames.log(registration.poses @ frames.inverse(poses_model)),
         view_rms=per_view_rms(registration.overlaps, len(capture.scans)),
-        fused=fused,
-        unsupported=unsupported,
+        fusion_source=fusing.result,
         repeatability=scatter,
         verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
@@ -231,6 +223,24 @@ def _register_views(
     stage = replace(stage, method=method)
     recorder.stage(stage, registration.poses)
     return registration, stage
+
+
+def _fuse_views(placed: RegisteredSession, recorder: Recorder, until_screened: Callable[[], None]) -> Fusion:
+    """Return the registered views of a session fused, which a recorder is shown.
+
+    Raises:
+        InputError: a scan changed on disk since it was read.
+    """
+    if has_whole_clouds(placed.session):
+        # Every point is then read from the files again, which takes time and memory: only for views that stay.
+        until_screened()
+    clock = Clock()
+    cloud, unsupported = fuse_every_point(placed)
+    several = int((cloud.count > 1).sum())
+    rms, note = _fused_rms(cloud.residual), support_note(unsupported)
+    stage = StageResult("fuse", rms, several, iterations=1, seconds=clock.lap(), note=note)
+    recorder.stage(stage, placed.poses)
+    return Fusion(cloud, unsupported, stage)
 
 
 def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str) -> StageResult:

@@ -22,7 +22,7 @@ from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_ey
 from stitch.observations.targets.rows import drawing_of, initial_landmarks
 from stitch.observations.targets.target_model import TargetModelFit, rms_of, target_model
 from stitch.recorder import Recorder
-from stitch.run_data import Fit, FusedCloud, StageResult
+from stitch.run_data import Fit, FusedCloud, Fusion, StageResult
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
@@ -161,12 +161,12 @@ def register_session(
     recorder.stage(registered, poses)
     scatter = repeatability_from(targets.variances)
     fit = Fit(
-        stages=(coarse, corrected, registered),
+        stages_before=(coarse, corrected, registered),
         poses_model=poses_model,
         poses=poses,
         corrections=frames.log(poses @ frames.inverse(poses_model)),
         view_rms=np.sqrt(targets.view_squares),
-        fused=_targets_as_cloud(targets),
+        fusion_source=Fusion(_targets_as_cloud(targets)),
         repeatability=scatter,
         verdict=target_sentence(targets, registered.rms, scatter, session.length_unit),
         convergence={"correct": list(targets.history), "register": [registered.rms]},

@@ -12,8 +12,6 @@ from stitch.output.comparison.model_history import effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.run_data import RunData
 
-# Scanners leave a few points in the air beside edges, which is no news.
-_WORTH_A_LINE = 0.005
 # Characters of a line of the report.
 _WIDTH = 100
 
@@ -100,7 +98,7 @@ def axis_lines(run: RunData) -> list[str]:
 
 
 def report_rows(run: RunData) -> list[tuple[str, str]]:
-    """Return rows (name, text) of a run's numbers: errors, noise, scatter of the poses, fitted effects, points dropped.
+    """Return rows (name, text) of a run's numbers: errors, noise, scatter of the poses, fitted effects.
 
     The error on views left out is that of every model in the ledger.
     """
@@ -108,19 +106,13 @@ def report_rows(run: RunData) -> list[tuple[str, str]]:
     amounts: dict[str, list[str]] = {}
     for effect, p in _fitted(run):
         amounts.setdefault(effect, []).append(f"{p.name} = {p.formatted}")
-    rows = [
+    return [
         ("error on views left out", ", ".join(f"{model} {text}" for model, text in _history(run)) or heldout),
         ("error in the fit", inside),
         ("sensor's noise alone", noise),
         scatter,
         *((effect, ", ".join(texts)) for effect, texts in amounts.items()),
     ]
-    dropped = run.fit.unsupported
-    if dropped.share > _WORTH_A_LINE:
-        alone = f"{dropped.alone / dropped.points:.1%} on no surface"
-        through = f"{dropped.looked_through / dropped.points:.1%} where other views look past"
-        rows.append(("points left out of the cloud", f"{dropped.share:.1%} ({alone}, {through})"))
-    return rows
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:

@@ -20,7 +20,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output import result_document as results
 from stitch.output.json_file import SCANS
 from stitch.output.schema import read_checked
-from stitch.run_data import Fit, FusedCloud, LedgerStep, RunData
+from stitch.run_data import Fit, FusedCloud, Fusion, LedgerStep, RunData, Unsupported
 from stitch.screening.stock import locate_stock
 from stitch.session.capture import prepare_capture
 from stitch.session.kept_scans import read_scans
@@ -299,15 +299,20 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
             registered = collect_overlaps(capture, poses, gate)
         if document.get("targets") and capture.sightings is not None:
             targets = _target_fit(folder, run)
+    stated = results.RESULT.fields(document, Fit)
+    stages = {stage.name: stage for stage in stated.pop("stages")}
+    unsupported = stated.pop("unsupported", Unsupported())
+    fused = Fusion(fused_cloud(folder / "stitched.ply"), unsupported, stages.pop("fuse", None))
     return Fit(
+        stages_before=tuple(stages.values()),
         poses_model=capture.poses(run.model.T_mount),
         poses=poses,
         corrections=np.array([row.correction for row in views]),
         view_rms=np.array([row.rms for row in views]),
-        fused=fused_cloud(folder / "stitched.ply"),
+        fusion_source=fused,
         registered=registered,
         targets=targets,
-        **results.RESULT.fields(document, Fit),
+        **stated,
     )
 
 

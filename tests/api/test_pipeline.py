@@ -2,9 +2,10 @@
 
 import json
 from concurrent.futures import CancelledError
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
-from threading import current_thread
+from threading import Event, current_thread
 
 import numpy as np
 import pytest
@@ -19,12 +20,14 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.api.pipeline import change, run
+from stitch.api.pipeline import change, run, run_rig
 from stitch.errors import InputError
 from stitch.fit import surface_steps
 from stitch.fusion.fuse import RegisteredSession, fuse_every_point
 from stitch.fusion.register import DEFAULT
 from stitch.model.model_toml import keep_arm_effects
+from stitch.output.comparison.model_history import model_history
+from stitch.output.comparison.run_verdict import run_headline
 from stitch.output.result_document import model_of
 from stitch.output.run_folder import write_with_page
 from stitch.output.stored_run import load_run
@@ -109,6 +112,35 @@ def test_views_are_fused_while_they_are_screened_and_errors_are_told(monkeypatch
     monkeypatch.setattr(surface_steps, "fuse_every_point", without_room)
     with pytest.raises(InputError, match="no room"):
         run(session)
+
+
+def test_numbers_are_handed_over_before_the_cloud_is_there(monkeypatch):
+    session, looked_at = session_of(measured_blade(2, views=3, pixels=40)), Event()
+
+    def fused(registered):
+        assert looked_at.wait(timeout=30), "the run waited for the cloud"
+        return fuse_every_point(registered)
+
+    def look(runs):
+        (early,) = runs
+        numbers.update(T_mount=early.T_mount, covariance=early.mount_covariance, headline=headline_of(early))
+        stages.extend(stage.name for stage in early.fit.stages_before)
+        looked_at.set()
+
+    def headline_of(found):
+        return run_headline(found, model_history(found))
+
+    numbers, stages, memory = {}, [], RecorderMemory()
+    monkeypatch.setattr(surface_steps, "fuse_every_point", fused)
+    (found,) = run_rig([session], recorders=[memory], on_registered=look)
+    assert np.array_equal(found.T_mount, numbers["T_mount"])
+    assert np.array_equal(found.mount_covariance, numbers["covariance"])
+    assert headline_of(found) == numbers["headline"]
+    assert [*stages, "fuse"] == [stage.name for stage in found.stages]
+    assert [arguments[0].name for call, arguments in memory.calls if call == "stage"] == [*stages, "fuse"]
+    assert memory.calls[-1][0] == "finish"
+    # A copy holds the cloud and no thread.
+    assert np.array_equal(deepcopy(found).fused.points, found.fused.points)
 
 
 def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path):
