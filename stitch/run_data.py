@@ -82,7 +82,7 @@ class Unsupported(Value):
     """Numbers of scanned points, and of those that are not in the stitched cloud.
 
     Example:
-        >>> run.fit.fusion.unsupported.share < 0.01
+        >>> 0 <= run.fit.unsupported.share < 1
         True
     """
 
@@ -167,7 +167,7 @@ class Fit(Value):
         ((5, 4, 4), (5, 6))
     """
 
-    stages_before: tuple[StageResult, ...]  # fuse
+    stages_before: tuple[StageResult, ...]  # coarse, correct, register
     poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
     poses: Array  # (V, 4, 4) T_reference_scanner after register
     view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
@@ -206,6 +206,11 @@ class Fit(Value):
         return self.fusion.cloud
 
     @property
+    def unsupported(self) -> Unsupported:
+        """Points that are not in the stitched cloud."""
+        return self.fusion.unsupported
+
+    @property
     def stages(self) -> tuple[StageResult, ...]:
         """Rows of the stage table: coarse, correct, register, fuse."""
         return self.stages_before if self.fusion.stage is None else (*self.stages_before, self.fusion.stage)
@@ -215,9 +220,8 @@ class Fit(Value):
         return vars(self) | {"fusion_source": self.fusion}
 
     def _stored(self) -> dict[str, Any]:
-        stored = super()._stored() | {"stages": self.stages, "fusion": self.fusion}
-        del stored["stages_before"]
-        return stored
+        after = {"stages": self.stages, "fused": self.fused, "unsupported": self.unsupported}
+        return {name: value for name, value in super()._stored().items() if name != "stages_before"} | after
 
 
 @dataclass(frozen=True)

@@ -583,7 +583,7 @@ RESULT = Document(
     Key("left_out", _LEFT_OUT.rows(), optional=True),
     Key("stock", _STOCK.rows(), write=_stock_rows, when=lambda r: any(s.stock for s in r.measurement.capture.scans)),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
-    Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.fusion.unsupported", of=Fit, optional=True),
+    Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
     Key("position_error", _SIZES, "targets.distances", when=attrgetter("targets")),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
