@@ -4,12 +4,14 @@ import html
 import json
 import re
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import trimesh
 from matplotlib.figure import Figure
+from PIL import Image
 from scipy.spatial.transform import RigidTransform
 
 import stitch
@@ -91,7 +93,7 @@ def test_the_report_has_every_part_once(found, better):
 def test_a_cell_of_a_notebook_asks_no_server_and_holds_the_viewer(found):
     cell = found._repr_html_()
     page = html.unescape(re.search(r'srcdoc="([^"]*)"', cell)[1])
-    assert page.startswith("<!doctype html>") and 'id="part-data"' in page and "showPart" in page
+    assert page.startswith("<!doctype html>") and 'id="part-data"' in page and "function partDrawing" in page
     assert not re.search(r"(src|href)=\"(?!data:)", page) and "fetch(" not in page
     assert isinstance(found.plot(), Figure)
 
@@ -117,8 +119,11 @@ def test_a_viewer_in_the_cell_is_drawn_by_a_browser(found, browser):
     page = browser.new_page()
     page.set_content(found._repr_html_())
     frame = page.frame_locator("iframe")
-    frame.locator(".part.live canvas").wait_for(timeout=20_000)
-    assert "the views disagree by" in frame.locator("[data-title]").inner_text()
+    frame.locator("[data-now] canvas").wait_for(timeout=20_000)
+    assert "the views disagree by" in frame.locator(".verdict").first.inner_text()
+    # More colours than one: the part is drawn.
+    drawn = frame.locator("[data-now] canvas").screenshot()
+    assert len(np.unique(np.asarray(Image.open(BytesIO(drawn)).convert("RGB")).reshape(-1, 3), axis=0)) > 100
     page.close()
 
 
@@ -135,7 +140,9 @@ def test_a_saved_run_is_what_the_command_writes(loaded, cell_folder, tmp_path, s
     stitch_command("add", tmp_path / "arrays", "range_scale", "--no-recording")
     better, added = stitch.add(from_arrays, "range_scale"), stitch.load_run(tmp_path / "arrays")
     assert np.allclose(added.T_mount, better.T_mount, atol=1e-9) and added.effects == better.effects
-    from_arrays.save(tmp_path / "arrays", recording=False)
+    with pytest.raises(InputError, match="history of its own"):
+        from_arrays.save(tmp_path / "arrays", recording=False)
+    from_arrays.save(tmp_path / "arrays", recording=False, force=True)
     assert same_folder(tmp_path / "command", tmp_path / "arrays")
 
 
