@@ -145,11 +145,8 @@ def run_rig(
                 left_out = sorted(screening.left_out, key=lambda item: names.index(item.view))
                 screening = replace(screening, left_out=tuple(left_out), doubts=(*doubts, *screening.doubts))
                 session, fitted = screened.sessions[i], screened.fitted
-                fit, floor = registered[i]
-                known = replace(fit, **limits[i]), floor
-                run = _assemble_run(
-                    session, i, fitted, hand_eyes[i], known, screening, keep=keep, notes=notes, alone=alone
-                )
+                found = registered[i], limits[i], screening
+                run = _assemble_run(session, i, fitted, hand_eyes[i], *found, keep=keep, notes=notes, alone=alone)
                 runs.append(replace(run, effects_file=model.effects_file if model else effects_file))
             if on_registered is not None:
                 on_registered(runs)
@@ -524,6 +521,7 @@ def _assemble_run(
     fitted: FittedRig,
     start: CoarseHandEye,
     registered: tuple[Fit, float],
+    limits: dict[str, Any],
     screening: ViewScreening,
     *,
     keep: bool = False,
@@ -537,6 +535,7 @@ def _assemble_run(
         fitted: hand-eye and effects of the whole rig.
         start: the hand-eye before the correction, and where it is from.
         registered: the session registered, and the rms that perfect poses would leave, length_unit.
+        limits: fields of `Fit` on what the views do not show of the hand-eye.
         screening: which of its views belong, and what is to be doubted.
         keep: views that do not belong were fused all the same: they are noted as kept, and none as left out.
         notes: sentences on what the sessions share.
@@ -550,6 +549,7 @@ def _assemble_run(
     notes_on_fit = pipeline_for(session).notes(session, fitted, index, start)
     fit = replace(
         fit,
+        **limits,
         targets=fitted.sessions[index].targets,
         outliers=fitted.sessions[index].outliers,
         notes=(*notes_on_views, *notes_on_fit, *session_notes(session), *notes),
@@ -625,10 +625,9 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
             warnings = session_warnings(session, fitted.sessions[index].measurement, fitted.correction, index)
             conductor.wait_for_covariance()
             limits = _hand_eye_limits(session, index, fitted, hand_eye)
-            ((fit, floor),) = conductor.registered()
+            (registered,) = conductor.registered()
             screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
-            known = replace(fit, **limits), floor
-            run = _assemble_run(session, index, fitted, hand_eye, known, screening, alone=state.alone)
+            run = _assemble_run(session, index, fitted, hand_eye, registered, limits, screening, alone=state.alone)
             conductor.finish([run])
         run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
         recorder.finish(run)
